@@ -21,7 +21,6 @@ from demandops.model.config.load import load
 from demandops.model.demand.claim import Claim
 from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.ledger import Ledger
-from demandops.model.ledger.records import RecentShutdowns
 from demandops.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit import plain_yaml
@@ -123,12 +122,6 @@ class MemoryRepo:
             for minute, goal in enumerate(goals)
         ]
 
-    def forget_shutdowns(self) -> None:
-        ledger = self.state.ledger
-        self.state = replace(self.state, ledger=replace(ledger, shutdowns=RecentShutdowns()))
-        for digest in ledger.shutdowns.by_digest:
-            del self.files[records.shutdowns_path(digest)]
-
     def faults(self, goal: object) -> list[str]:
         """Send a goal that must be refused; return its faults, each as ``field: message``."""
         refusal = self.take(goal)
@@ -180,7 +173,7 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 
 def is_of_ledger(path: str) -> bool:
-    roots = (records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT, records.WAITING_ROOT)
+    roots = (records.REPLICAS_ROOT, records.WAITING_ROOT)
     return bool(claim_file.kind_of(path)) or path.startswith(roots)
 
 
@@ -191,7 +184,6 @@ def ledger_in(files: Mapping[str, str]) -> Ledger:
     ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
     return replace(
         ledger,
-        shutdowns=records.read_all_shutdowns(booked),
         waiting=records.read_all_waiting(booked),
         kept=records.read_all_replicas(booked),
     )

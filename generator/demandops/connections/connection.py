@@ -215,9 +215,6 @@ class Connection:
             and listed.type in (None, self.type)
         )
 
-    def distinguishing_values(self) -> tuple[str, ...]:
-        return (self.source, self.target, self.known_type.word)
-
     def topic_keys(self) -> Iterator[TopicKey]:
         for route in self.topics:
             yield (route.source,)

@@ -32,7 +32,7 @@ from demandops.model.demand.demand_request import (
     Shutdown,
 )
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
-from demandops.model.ledger.records import RecentShutdown, Wait
+from demandops.model.ledger.records import Wait
 
 # ---- owners: the requesters for whom a demand that has an id holds claims or waits ----
 #
@@ -206,12 +206,16 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
         listed.add(item.held.subject)
         key = ClaimKey(item.held.subject, demand_id(request.id, item.requesters))
         # a put may have chosen this id for its demand, because demand ids are free text
-        claims = start.claims_of_demand(key.demand)
-        owners = {who for claim in claims for who in claim.requesters}
-        if owners and owners.isdisjoint(item.requesters):
+        others = [
+            claim
+            for claim in start.claims_of_demand(key.demand)
+            if not (claim.joined and claim.request == request.id)
+            or {*claim.requesters}.isdisjoint(item.requesters)
+        ]
+        if others:
             message = (
                 f"gives the demand id {key.demand}, which belongs to a demand of "
-                f"{', '.join(sorted(owners))}; use another id"
+                f"{', '.join(requesters_of(others))}; use another id"
             )
             faults.append(fault("id", message, code="conflict"))
         ledger = book(ledger, item, request.id, key, ledger.get(key), now, joined=True)
@@ -219,13 +223,7 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     if faults:
         raise Refused(faults)
     changes = claim_changes(start, ledger, keys)
-    if not changes:
-        return start, Changes()
-    # A join that only renews claims keeps the records of recent shutdowns. If it removed the record
-    # of a shutdown, a repeat of this shutdown would count as a new one and end another demand.
-    adds = not all(change.only_renews for change in changes)
-    shutdowns, forgotten = start.shutdowns.forget(now, request.requesters() if adds else ())
-    return replace(ledger, shutdowns=shutdowns), Changes(claims=changes, shutdowns=forgotten)
+    return ledger, Changes(claims=changes)
 
 
 def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
@@ -252,42 +250,31 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
     return ledger.without_waiting(waited), changes
 
 
-def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Take one hold from each requester that a shutdown names, on each topic that it lists.
+def shut_down(ledger: Ledger, request: Shutdown) -> tuple[Ledger, Changes]:
+    """Take what a shutdown lists, or all of an item that lists nothing.
 
-    If several claims hold the topic for the requester, the hold is taken from the claim with the
-    shutdown's request id and requesters, else from the oldest other claim with this request id,
-    else from the oldest claim. If the shutdown lists no topic of an application or a connection, it
-    takes all holds that the requester has in the first of these claims. It never takes holds from
-    the claims of a demand that has an id.
+    It takes from the claims that joins with its own request id and exactly its own requesters
+    booked, and never from others. So a shutdown that is sent again, or that nobody's join preceded,
+    ends nothing that somebody else demands.
     """
-    record = RecentShutdown.of(request, now)
-    repeats = ledger.shutdowns.earlier(record)
-    if repeats is not None:
-        return ledger, Changes(repeats=repeats)
-    start, not_held = ledger, list[str]()
-    taken: dict[tuple[ClaimKey, str], set[TopicKey]] = {}
+    taken, not_held = dict[ClaimKey, set[TopicKey]](), list[str]()
     for item in request.demanded:
-        own = demand_id(request.id, item.requesters)
-        for requester in item.requesters:
-            # look in the ledger before the request, so that a topic listed twice is taken once
-            claims = sorted(
-                (
-                    claim
-                    for claim in start.claims_held_by(requester, item.held.subject)
-                    if claim.joined and claim.held.matches_listed(item.held)
-                ),
-                key=lambda c: (c.demand != own, c.request != request.id, c.booked, c.demand),
-            )
-            for words, claim, held in _holds(item, requester, claims):
-                if claim is None:
-                    not_held.append(words)
+        subject, who = item.held.subject, ", ".join(sorted(set(item.requesters)))
+        claim = ledger.get(ClaimKey(subject, demand_id(request.id, item.requesters)))
+        if claim and not (claim.joined and claim.held.matches_listed(item.held)):
+            claim = None
+        listed = [words for words, _ in item.held.listed_topics(item.held)]
+        if claim is None:
+            not_held += [f"{subject}: {words} for {who}" for words in listed]
+            not_held += [] if listed else [f"{subject} for {who}"]
+        elif not listed:
+            taken.setdefault(claim.key, set()).update(claim.held.topic_keys())
+        else:
+            for words, held in claim.held.listed_topics(item.held):
+                if held:
+                    taken.setdefault(claim.key, set()).update(held)
                 else:
-                    taken.setdefault((claim.key, requester), set()).update(held)
-    for (key, requester), topics in taken.items():
-        left = ledger.get(key)
-        assert left is not None  # noqa: S101 - the requester's holds are in the claim until now
-        ledger = ledger.replace(key, left.without_holds(requester, topics))
+                    not_held.append(f"{subject}: {words} for {who}")
     if not taken:
         similar = [
             f"{claim.subject} for {', '.join(claim.requesters)} ("
@@ -297,45 +284,25 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
                 else f"demand '{claim.demand}', which a shutdown cannot end)"
             )
             for subject in request.subjects()
-            for claim in start.claims_on(subject)
+            for claim in ledger.claims_on(subject)
         ] or [
             f"{claim.subject} for {', '.join(claim.requesters)}"
             for requester in sorted(request.requesters())
-            for claim in start.claims_of_requester(requester)
+            for claim in ledger.claims_of_requester(requester)
         ]
         shown = "; ".join(dict.fromkeys(similar[:5])) or "none"
-        message = f"nothing that the shutdown lists is held; similar claims: {shown}"
+        message = (
+            f"nothing that the shutdown lists is held by the request '{request.id}' of these "
+            f"requesters; similar claims: {shown}"
+        )
         place = request.demanded[0].fault if request.demanded else fault
         raise Refused([place("id", message, code="not-held")])
-    shutdowns, forgotten = ledger.shutdowns.forget(now)
-    ledger = replace(ledger, shutdowns=shutdowns.replace(record.digest, record))
-    return ledger, Changes(
-        claims=claim_changes(start, ledger, [key for key, _ in taken]),
-        not_held=tuple(dict.fromkeys(not_held)),
-        shutdowns=(*forgotten, record.digest),
-    )
-
-
-def _holds(
-    item: Demanded, requester: str, claims: list[Claim]
-) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
-    """Yield (text, first claim with matching holds, their keys) for each topic that is listed."""
-    subject = item.held.subject
-    listed = [words for words, _ in item.held.listed_topics(item.held)]
-    # who lists no topic means all of the first claim
-    if not claims or not listed:
-        first = next(iter(claims), None)
-        yield f"{subject} for {requester}", first, list(first.held.topic_keys()) if first else []
-        return
-    by_claim = [(claim, dict(claim.held.listed_topics(item.held))) for claim in claims]
-    for words in listed:
-        for claim, meant in by_claim:
-            held = [topic for topic in meant[words] if requester in claim.holders(topic)]
-            if held:
-                yield words, claim, held
-                break
-        else:
-            yield f"{subject}: {words} for {requester}", None, []
+    after = ledger
+    for key, topics in taken.items():
+        claim = ledger.get(key)
+        after = after.replace(key, claim and claim.without_topics(topics))
+    changes = claim_changes(ledger, after, taken)
+    return after, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
 
 
 def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
@@ -443,7 +410,7 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
         case Join():
             return join(ledger, request, now)
         case Shutdown():
-            return shut_down(ledger, request, now)
+            return shut_down(ledger, request)
         case Put():
             return put(ledger, request, now)
         case Release():

@@ -148,10 +148,6 @@ def _ledger_files(
         checkpoint()
         path = claim_file.path_of(change.key)
         files[path] = claim_file.text_of(change.after) if change.after else None
-    for digest in changes.shutdowns:
-        shutdown = ledger.shutdowns.by_digest.get(digest)
-        path = records.shutdowns_path(digest)
-        files[path] = records.shutdowns_text(shutdown) if shutdown else None
     for instance in changes.kept:
         steps = ledger.kept.steps.get(instance)
         path = records.replicas_path(instance)

@@ -371,9 +371,6 @@ def notes_on(
                 )
     yield from warnings.notes(request, after)
     yield from rendered.blocked
-    if changes.repeats is not None:
-        at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
-        yield f"the same shutdown was carried out at {at}, so this one releases nothing more"
     if isinstance(request, Drain):
         yield from request.stays
     if isinstance(request, Wait):
@@ -411,7 +408,7 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
         # an edit that only takes requesters away has the effect of a release, which is allowed
         if (
             (old := change.before)
-            and replace(claim, requesters=old.requesters, partial=old.partial) == old
+            and replace(claim, requesters=old.requesters) == old
             and {*claim.requesters} <= {*old.requesters}
         ):
             continue

@@ -62,11 +62,8 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
             lease = Term(restored.lease.seconds, restored.lease.slack).lease_from(now)
             restored = replace(restored, lease=lease)
         ledger = ledger.replace(change.key, restored)
-    booked = {who for change in changes if change.after for who in change.after.requesters}
-    shutdowns, forgotten = start.shutdowns.forget(now, booked)
-    return replace(ledger, shutdowns=shutdowns), Changes(
-        claims=claim_changes(start, ledger, [change.key for change in changes]), shutdowns=forgotten
-    )
+    keys = [change.key for change in changes]
+    return ledger, Changes(claims=claim_changes(start, ledger, keys))
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:

@@ -147,6 +147,7 @@ def _plan(
             raise InvalidInput(held)
     files_of_ledger = _in_this_schema(trees.texts(tree, (LEDGER_ROOT,)), state.ledger)
     changed = dict(batch.render_all(state, {**files_of_ledger, **applied.files}).files)
+    changed |= dict.fromkeys(trees.texts(tree, records.GONE_ROOTS))
     if files[ROOT_FILE] != before:
         changed[ROOT_FILE] = files[ROOT_FILE]
     upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))

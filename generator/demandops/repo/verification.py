@@ -33,10 +33,10 @@ from demandops.repo.load.snapshot import changed_kept_replicas
 # A commit of the generator may change generated files, reports, and the claims that its message
 # names. Some operations may change further files.
 
-# The folders of the ledger that have records, such as recent shutdowns, instead of claims.
-_RECORDS = tuple(
-    f"{root}/" for root in (records.MARKERS_ROOT, records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT)
-)
+# The folders of the ledger that have records, such as markers, instead of claims.
+_RECORDS = tuple(f"{root}/" for root in (records.MARKERS_ROOT, records.REPLICAS_ROOT))
+# No decision depends on what is below these.
+_GONE = tuple(f"{root}/" for root in records.GONE_ROOTS)
 # Operations that may rewrite a claim, to start its lease or to change its schema.
 _REWRITING = ("follow", "upgrade")
 # Operations that may add or remove the marker of an ended override.
@@ -56,6 +56,8 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
         if root in (*GENERATED_ROOTS, NOTES_ROOT) or (path == ROOT_FILE and operation == "upgrade"):
+            continue
+        if path.startswith(_GONE):
             continue
         if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
             continue
@@ -97,8 +99,6 @@ def _may_record(commit: Commit, path: str, operation: str) -> bool:
     if path.startswith(f"{records.MARKERS_ROOT}/"):
         is_valid = not text or bool(records.read_ended_override({path: text}))
         return operation in _ENDING and is_valid
-    if path.startswith(f"{records.SHUTDOWNS_ROOT}/"):
-        return operation in ("shutdown", "join", "rollback")
     record = records.read_replicas(text, path)
     is_canonical = record is not None and records.replicas_text(*record) == text
     return operation not in (*_REWRITING, *_ENDING) and (not text or is_canonical)

@@ -100,7 +100,7 @@ def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[Clai
             connection = replace(connection, topics=(same,))
         put = Put("", (Demanded(connection, claim.requesters, str),))
         (item,) = admission.with_chosen_types(put, config, ledger.connection).demanded
-        booked = replace(claim, held=item.held.booked(), partial={})
+        booked = replace(claim, held=item.held.booked())
         if current := ledger.get(booked.key):
             booked = replace(current, held=current.connection.extended(booked.connection).booked())
         ledger = ledger.replace(booked.key, booked)

@@ -216,7 +216,7 @@ def _kept_claim(
         return None
     name, who = OVERRIDE_PREFIX + keeping[0].name, (keeping[0].owner,)
     last = replace(last, demand=name, request=name, requesters=who, booked=now)
-    return replace(last, lease=None, joined=False, partial={})
+    return replace(last, lease=None, joined=False)
 
 
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:

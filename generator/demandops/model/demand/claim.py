@@ -197,9 +197,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             and listed.appdef == self.appdef
         )
 
-    def distinguishing_values(self) -> tuple[str, ...]:
-        return (self.node, self.appdef)
-
     def topic_keys(self) -> Iterator[TopicKey]:
         # (role, topic, source) of each input; without inputs one empty key
         for role, topic in self.all_inputs():
@@ -348,10 +345,8 @@ class Claim:
     requesters: tuple[str, ...]
     booked: datetime
     lease: Lease | None = None
-    # A goal of the reference's action booked it; a shutdown takes holds only from such claims
+    # A goal of the reference's action booked it; a shutdown takes only from such claims
     joined: bool = False
-    # The topics that only some requesters hold
-    partial: Mapping[TopicKey, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def application(self) -> Application:
@@ -385,51 +380,23 @@ class Claim:
         yield ("demand", self.demand)
         for requester in self.requesters:
             yield ("requester", requester)
-            yield ("holder", requester, self.subject.kind.value, self.subject.id)
         if self.keeping_override is not None:
             yield ("kept",)
             yield ("kept", self.subject.kind.value, self.subject.id)
         yield from self.held.index_entries()
 
-    def holders(self, topic: TopicKey) -> tuple[str, ...]:
-        return self.partial.get(topic, self.requesters)
-
-    def with_holders(
-        self, held: Application | Connection, holders: Mapping[TopicKey, tuple[str, ...]]
-    ) -> Claim:
-        requesters = tuple(sorted({who for names in holders.values() for who in names}))
-        partial = {topic: names for topic, names in holders.items() if names != requesters}
-        return replace(self, held=held, requesters=requesters, partial=partial)
-
     def extending(self, current: Claim) -> Claim:
         # with everything added that the claim so far holds
-        held = current.held.extended(self.held).booked()  # type: ignore[arg-type]  # of one kind
-        # a shutdown may have taken holds: only what is listed again is held by all requesters
-        holders = dict.fromkeys(held.topic_keys(), self.requesters)
-        listed = {*self.held.topic_keys()}
-        kept = {topic: current.holders(topic) for topic in holders if topic not in listed}
-        return self.with_holders(held, holders | kept)
+        held = current.held.extended(self.held)  # type: ignore[arg-type]  # of one kind
+        return replace(self, held=held.booked())
 
-    def without_holds(
-        self, requester: str, topics: Container[TopicKey] | None = None
-    ) -> Claim | None:
-        holders, gone = dict[TopicKey, tuple[str, ...]](), set[TopicKey]()
-        for topic in self.held.topic_keys():
-            names = self.holders(topic)
-            if topics is None or topic in topics:
-                names = tuple(who for who in names if who != requester)
-            if names:
-                holders[topic] = names
-            else:  # nobody holds the topic any longer, so the claim loses it
-                gone.add(topic)
-        held = self.held.without_topics(gone) if gone else self.held
-        return None if held is None else self.with_holders(held, holders)
+    def without_topics(self, gone: Container[TopicKey]) -> Claim | None:
+        held = self.held.without_topics(gone)
+        return replace(self, held=held) if held else None
 
     def without_node(self, node: str) -> Claim | None:  # the claim must need the node
         held = self.held.without_node(node)
-        if held is None:
-            return None
-        return self.with_holders(held, {t: self.holders(t) for t in held.topic_keys()})
+        return replace(self, held=held) if held else None
 
     def after_booking(self, current: Claim | None) -> Claim:
         if current is None:

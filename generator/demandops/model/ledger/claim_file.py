@@ -8,7 +8,6 @@ the path of its claim is that of another claim's file (:mod:`.collisions`).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
@@ -16,8 +15,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from demandops.base import naming, strict_yaml
-from demandops.base.errors import Fault, InvalidInput, fault
-from demandops.base.naming import Subject, SubjectKind, TopicKey
+from demandops.base.errors import InvalidInput
+from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.settings import LEDGER_API_VERSION
 from demandops.connections.connection import Connection, RouteOptions
@@ -86,6 +85,9 @@ def _end_of_lease(text: str) -> str:
 _EndOfLease = Annotated[str, AfterValidator(_end_of_lease)]
 # a person may list one twice or in another order
 _Requesters = Annotated[tuple[str, ...], AfterValidator(lambda names: tuple(sorted(set(names))))]
+# Older files name the requesters of a topic that only some of the claim's requesters held. Today
+# all of them hold all topics, so what is demanded by anybody stays.
+_NotRead = Annotated[object, Field(exclude=True)]
 
 
 class _Topic(FrozenModel):
@@ -93,7 +95,7 @@ class _Topic(FrozenModel):
     source: str
     type: str = ""
     further: bool = False
-    requesters: _Requesters = Field(default=(), strict=False)
+    requesters: _NotRead = None
 
 
 class _Place(FrozenModel):
@@ -118,7 +120,7 @@ class _Delivery(FrozenModel):
 
 class _Route(RouteOptions):
     target: str
-    requesters: _Requesters = Field(default=(), strict=False)
+    requesters: _NotRead = None
 
 
 # most routes are written as /a: /b, because they have no options
@@ -149,23 +151,9 @@ class _Claim(FrozenModel):
     def held(self) -> Application | Connection:
         raise NotImplementedError
 
-    def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
-        # (field of the file, topic, requesters) for each topic that lists requesters
-        raise NotImplementedError
-
-    def faults(self) -> Iterator[Fault]:
-        for place, _, names in self.partial():
-            if unknown := set(names) - set(self.requesters):
-                message = (
-                    f"{', '.join(sorted(unknown))} is not among the requesters of the claim; add "
-                    "this name to the claim's requesters, or remove the name from this topic"
-                )
-                yield fault(f"{place}.requesters", message)
-
     def claim(self) -> Claim:
-        held = self.held()
-        claim = Claim(
-            held=held,
+        return Claim(
+            held=self.held(),
             demand=self.demand,
             request=self.request,
             requesters=self.requesters,
@@ -175,11 +163,6 @@ class _Claim(FrozenModel):
             joined=self.action is not None
             or (self.apiVersion == "demandops.ledger/v1" and bool(_JOINED.fullmatch(self.demand))),
         )
-        partial = {key: names for _, key, names in self.partial()}
-        if not partial:
-            return claim
-        holders = {key: partial.get(key, self.requesters) for key in held.topic_keys()}
-        return claim.with_holders(held, holders)
 
 
 class _ApplicationFile(_Claim):
@@ -196,13 +179,6 @@ class _ApplicationFile(_Claim):
     services: dict[str, str] = Field(default_factory=dict)
     moved: dict[str, str] = Field(default_factory=dict)
     named: tuple[str, ...] = Field(default=(), strict=False)
-
-    def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
-        for role, topics in self.inputs.items():
-            for index, topic in enumerate(topics):
-                if topic.requesters:
-                    place = f"inputs.{role}[{index}]"
-                    yield place, (role, topic.topic, topic.source), topic.requesters
 
     def held(self) -> Application:
         inputs = {
@@ -235,11 +211,6 @@ class _ConnectionFile(_Claim):
     broker: str = ""
     topics: dict[str, _RouteEntry] = Field(min_length=1)
 
-    def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
-        for source, route in self.topics.items():
-            if route.requesters:
-                yield f"topics.{source}", (source,), route.requesters
-
     def held(self) -> Connection:
         topics = tuple(
             topic.route(source, topic.target) for source, topic in sorted(self.topics.items())
@@ -251,10 +222,6 @@ class _ConnectionFile(_Claim):
 def text_of(claim: Claim) -> str:
     held = claim.held
 
-    def requesters(*topic: str) -> dict[str, list[str]]:
-        names = claim.partial.get(topic)
-        return {"requesters": list(names)} if names else {}
-
     data: dict[str, Any]
     if isinstance(held, Application):
         inputs: dict[str, list[dict[str, Any]]] = {role: [] for role in held.inputs}
@@ -262,7 +229,7 @@ def text_of(claim: Claim) -> str:
             entry: dict[str, Any] = {"topic": topic.topic, "source": topic.source}
             entry |= {"type": topic.type} if topic.type else {}
             entry |= {"further": True} if topic.further else {}
-            inputs[role].append(entry | requesters(role, topic.topic, topic.source))
+            inputs[role].append(entry)
         deliver = [{k: v for k, v in item._asdict().items() if v} for item in held.deliver]
         # Empty fields are left out, so that a new field leaves other claims' files as they are
         further = {
@@ -280,7 +247,7 @@ def text_of(claim: Claim) -> str:
     else:
         topics: dict[str, str | dict[str, Any]] = {}
         for route in held.topics:
-            options = route.options() | requesters(route.source)
+            options = route.options()
             topics[route.source] = {"target": route.target, **options} if options else route.target
         kind, data = "Connection", {"type": held.known_type.word, "source": held.source}
         data |= {"target": held.target} | ({"broker": held.broker} if held.broker else {})
@@ -340,8 +307,6 @@ def read(text: str, path: str) -> Claim:
     else:
         message = f"is {kind!r}, but must be ApplicationClaim or ConnectionClaim"
         raise InvalidInput.at("kind", message, file=path)
-    if faults := [fault.within(path) for fault in file.faults()]:
-        raise InvalidInput(faults)
     claim = file.claim()
     # a file that was moved would be a second claim with the same key
     if path_of(claim.key) != path:

@@ -21,8 +21,6 @@ from demandops.model.ledger.claim_file import minute_of
 from demandops.model.ledger.records import (
     Instance,
     KeptReplicas,
-    RecentShutdown,
-    RecentShutdowns,
     WaitingDemands,
 )
 
@@ -53,7 +51,6 @@ class Ledger:
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
     # the end that each ended override had when it ended, by name
     ended: Mapping[str, str] = field(default_factory=dict)
-    shutdowns: RecentShutdowns = field(default_factory=RecentShutdowns)
     # For how many applications each node was chosen, also if only for one of their services. The
     # choice of nodes takes the emptiest, and must not count all claims for each demand.
     applications_on: HashTrieMap[str, int] = field(default_factory=HashTrieMap)
@@ -151,9 +148,6 @@ class Ledger:
 
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
         return self._claims("requester", requester)
-
-    def claims_held_by(self, requester: str, subject: Subject) -> tuple[Claim, ...]:
-        return self._claims("holder", requester, subject.kind.value, subject.id)
 
     def count_of_requester(self, requester: str) -> int:
         return len(self.index.get(("requester", requester)) or ())
@@ -311,12 +305,8 @@ class ClaimChange:
 @dataclass(frozen=True, slots=True)
 class Changes:
     claims: tuple[ClaimChange, ...] = ()
-    # in words, what a shutdown lists, but its requesters do not hold
+    # in words, what a shutdown lists, but its claim does not hold
     not_held: tuple[str, ...] = ()
-    # the digests of shutdowns that the ledger now records or forgets
-    shutdowns: tuple[str, ...] = ()
-    # the earlier shutdown that the request repeats
-    repeats: RecentShutdown | None = None
     # the service instances whose kept replicas changed
     kept: tuple[Instance, ...] = ()
     # the ids of the demands that begin or cease to wait, or that now wait with another goal
