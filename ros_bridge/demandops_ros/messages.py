@@ -11,7 +11,7 @@ from builtin_interfaces.msg import Duration
 from demandops.base.errors import suggestion
 from demandops.base.settings import API_VERSION
 from demandops.cluster.health import Level
-from demandops.connections.connection import RouteOptions
+from demandops.connections.connection import ROUTE_OPTIONS
 from demandops.model.config.base_model import seconds_of
 from demandops_interfaces import msg as messages
 from demandops_interfaces.action import Demand as DemandMessage
@@ -49,7 +49,7 @@ _CONNECTION = {
     "broker": "broker_node_id",
 }
 _ROUTE = {"source": "source_topic", "target": "target_topic"}
-_ROUTE |= {name: name for name in RouteOptions.model_fields}
+_ROUTE |= {name: name for name in ROUTE_OPTIONS}
 
 
 def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -220,8 +220,6 @@ def marker(data: bytes) -> None:
     records.read_ended_override({records.ended_override_path("x"): _text(data)})
 
 
-def shutdown(data: bytes) -> None:
-    records.read_all_shutdowns({records.shutdowns_path("0f" * 10): _text(data)})
 
 
 def waiting_demand(data: bytes) -> None:
@@ -437,8 +435,8 @@ TARGETS = (
     Target(chart_file, _seeds_of(_CHARTS)),
     Target(chart_values, values=_changed_charts()),
     Target(set_key, tuple(_CONFIG[path].encode() for path in _FILES)),
-    Target(claim, _bytes(path for path in _BOOKED if "shutdowns" not in path.parts)),
-    *(Target(one, _seeds(one)) for one in (marker, shutdown, waiting_demand)),
+    Target(claim, _bytes(_BOOKED)),
+    *(Target(one, _seeds(one)) for one in (marker, waiting_demand)),
     Target(contexts_file, _seeds(contexts_file)),
     Target(detector_rules, (*_seeds(detector_rules), _RULES.read_bytes())),
     Target(end_of_override, _seeds(end_of_override), expected=(click.BadParameter,)),

@@ -22,7 +22,6 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
-from demandops.model.ledger.records import RecentShutdowns
 from demandops.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit import plain_yaml
@@ -115,12 +114,6 @@ class MemoryRepo:
             for minute, goal in enumerate(goals)
         ]
 
-    def forget_shutdowns(self) -> None:
-        ledger = self.state.ledger
-        self.state = replace(self.state, ledger=replace(ledger, shutdowns=RecentShutdowns()))
-        for digest in ledger.shutdowns.by_digest:
-            del self.files[records.shutdowns_path(digest)]
-
     def faults(self, goal: object) -> list[str]:
         """Send a goal that must be refused; return its faults, each as ``field: message``."""
         refusal = self.take(goal)
@@ -172,8 +165,7 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 
 def is_of_ledger(path: str) -> bool:
-    roots = (records.SHUTDOWNS_ROOT, records.WAITING_ROOT)
-    return bool(claim_files.kind_of(path)) or path.startswith(roots)
+    return bool(claim_files.kind_of(path)) or path.startswith(records.WAITING_ROOT)
 
 
 def ledger_in(files: Mapping[str, str]) -> Ledger:
@@ -183,7 +175,6 @@ def ledger_in(files: Mapping[str, str]) -> Ledger:
     ledger = rebuilt(claim_files.read(booked.pop(path), path) for path in claims)
     return replace(
         ledger,
-        shutdowns=records.read_all_shutdowns(booked),
         waiting=records.read_all_waiting(booked),
     )
 

@@ -16,6 +16,7 @@ from demandops.base.naming import Subject
 from demandops.base.quoting import json_escaped, lines
 from demandops.cli.output import painted, print_lines, terminal_width
 from demandops.cli.table import Table
+from demandops.model.config.base_model import plain
 from demandops.model.config.override import Override, format_time
 from demandops.model.config.registry import ImagePin
 from demandops.model.demand.demand import Lease
@@ -114,7 +115,7 @@ def claim_data(claim: Claim) -> Json:
         "demand": claim.demand,
         "request": claim.request,
         "version": (app and app.version) or None,
-        "place": claim_files.place_data(app.place) if app and app.place else None,
+        "place": plain(app.place) if app and app.place else None,
         "services": dict(sorted(app.services.items())) if app and app.services else None,
         "requesters": list(claim.requesters),
         "since": time_data(claim.booked),

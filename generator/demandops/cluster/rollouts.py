@@ -45,8 +45,11 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
     active = without_suspended(after)
     claims = [*active.ledger.claims_of_demand(request.demand)]
     for demanded in request.demanded if request.adds_claims else ():
-        for requester in demanded.requesters:
-            claims += active.ledger.claims_held_by(requester, demanded.held.subject)
+        claims += [
+            claim
+            for claim in active.ledger.claims_on(demanded.held.subject)
+            if {*demanded.requesters} & {*claim.requesters}
+        ]
     changed = affected_keys(before, after, decision.changes.claims)
     targets = []
     for key in dict.fromkeys((*keys_of_claims(active, claims), *changed)):

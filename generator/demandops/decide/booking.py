@@ -6,13 +6,20 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from demandops.model.demand.demand import Operation
 from demandops.base.errors import Fault, Refused, fault, suggestion
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection
 from demandops.decide.rollback import Restoration, restore
-from demandops.model.demand.demand import Application, Decommission, Demand, Item, Term, renewed
+from demandops.model.demand.demand import (
+    Application,
+    Decommission,
+    Demand,
+    Item,
+    Operation,
+    Term,
+    renewed,
+)
 from demandops.model.ledger.claim import Claim, ClaimKey, demand_id, requesters_of
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
 from demandops.model.ledger.records import Wait
@@ -189,12 +196,16 @@ def join(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Change
         listed.add(item.held.subject)
         key = ClaimKey(item.held.subject, demand_id(request.id, item.requesters))
         # a put may have chosen this id for its demand, because demand ids are free text
-        claims = start.claims_of_demand(key.demand)
-        owners = {who for claim in claims for who in claim.requesters}
-        if owners and owners.isdisjoint(item.requesters):
+        others = [
+            claim
+            for claim in start.claims_of_demand(key.demand)
+            if not (claim.joined and claim.request == request.id)
+            or {*claim.requesters}.isdisjoint(item.requesters)
+        ]
+        if others:
             message = (
                 f"gives the demand id {key.demand}, which belongs to a demand of "
-                f"{', '.join(sorted(owners))}; use another id"
+                f"{', '.join(requesters_of(others))}; use another id"
             )
             faults.append(fault("id", message, code="conflict"))
         ledger = book(ledger, item, request.id, key, ledger.get(key), now, joined=True)
@@ -202,8 +213,6 @@ def join(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Change
     if faults:
         raise Refused(faults)
     changes = claim_changes(start, ledger, keys)
-    if not changes:
-        return start, Changes()
     return ledger, Changes(claims=changes)
 
 
@@ -232,33 +241,31 @@ def put(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes
 
 
 def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
-    """Take what a shutdown lists from the claims of its own request id and requesters.
+    """Take what a shutdown lists, or all of an item that lists nothing.
 
-    Of an item that lists no topic, the whole claim is taken. Nothing else is touched: no claim of
-    another request id or of other requesters, and none of a demand that has an id.
+    It takes from the claims that joins with its own request id and exactly its own requesters
+    booked, and never from others. So a shutdown that is sent again, or that nobody's join preceded,
+    ends nothing that somebody else demands.
     """
-    start, not_held, keys = ledger, list[str](), list[ClaimKey]()
+    taken, not_held = dict[ClaimKey, set[TopicKey]](), list[str]()
     for item in request.demanded:
-        subject = item.held.subject
-        key = ClaimKey(subject, demand_id(request.id, item.requesters))
-        claim = start.get(key)  # as before the request, so that a topic listed twice is taken once
-        listed = list(item.held.listed_topics(item.held))
-        if claim is None or not claim.joined or not claim.held.matches_listed(item.held):
-            not_held += [f"{subject}: {words}" for words, _ in listed] or [str(subject)]
-            continue
-        keys.append(key)
-        if not listed:
-            ledger = ledger.replace(key, None)
-            continue
-        gone = set[TopicKey]()
-        for words, topics in claim.held.listed_topics(item.held):
-            gone |= {*topics}
-            not_held += [] if topics else [f"{subject}: {words}"]
-        if (current := ledger.get(key)) is not None:
-            held = current.held.without_topics(gone)
-            ledger = ledger.replace(key, replace(current, held=held) if held else None)
-    changes = claim_changes(start, ledger, keys)
-    if not changes:
+        subject, who = item.held.subject, ", ".join(sorted(set(item.requesters)))
+        claim = ledger.get(ClaimKey(subject, demand_id(request.id, item.requesters)))
+        if claim and not (claim.joined and claim.held.matches_listed(item.held)):
+            claim = None
+        listed = [words for words, _ in item.held.listed_topics(item.held)]
+        if claim is None:
+            not_held += [f"{subject}: {words} for {who}" for words in listed]
+            not_held += [] if listed else [f"{subject} for {who}"]
+        elif not listed:
+            taken.setdefault(claim.key, set()).update(claim.held.topic_keys())
+        else:
+            for words, held in claim.held.listed_topics(item.held):
+                if held:
+                    taken.setdefault(claim.key, set()).update(held)
+                else:
+                    not_held.append(f"{subject}: {words} for {who}")
+    if not taken:
         similar = [
             f"{claim.subject} for {', '.join(claim.requesters)} ("
             + (
@@ -267,17 +274,25 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
                 else f"demand '{claim.demand}', which a shutdown cannot end)"
             )
             for subject in request.subjects()
-            for claim in start.claims_on(subject)
+            for claim in ledger.claims_on(subject)
         ] or [
             f"{claim.subject} for {', '.join(claim.requesters)}"
             for requester in sorted(request.requesters())
-            for claim in start.claims_of_requester(requester)
+            for claim in ledger.claims_of_requester(requester)
         ]
         shown = "; ".join(dict.fromkeys(similar[:5])) or "none"
-        message = f"nothing that the shutdown lists is held; similar claims: {shown}"
+        message = (
+            f"nothing that the shutdown lists is held by the request '{request.id}' of these "
+            f"requesters; similar claims: {shown}"
+        )
         place = request.demanded[0].fault if request.demanded else fault
         raise Refused([place("id", message, code="not-held")])
-    return ledger, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
+    after = ledger
+    for key, topics in taken.items():
+        claim = ledger.get(key)
+        after = after.replace(key, claim and claim.without_topics(topics))
+    changes = claim_changes(ledger, after, taken)
+    return after, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
 
 
 def release_demand(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:

@@ -10,7 +10,6 @@ from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Any, Literal
 
-from demandops.model.demand.demand import Demand
 from demandops.base.errors import Fault, InvalidInput, OverLimit, Refused, fault
 from demandops.base.quoting import one_line
 from demandops.base.strict_yaml import load_all, short_repr
@@ -23,7 +22,7 @@ from demandops.model.config.appdef import ApplicationDefinition
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override
 from demandops.model.config.repo_settings import ROOT_FILE
-from demandops.model.demand.demand import Application, InputTopic, Item
+from demandops.model.demand.demand import Application, Demand, InputTopic, Item
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Changes, Ledger, World

@@ -10,10 +10,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from demandops.model.demand.demand import Operation
 from demandops.base.errors import Fault, Refused, fault
 from demandops.decide.admission import admission, permission
-from demandops.model.demand.demand import Demand, Item, Term
+from demandops.model.demand.demand import Demand, Item, Operation, Term
 from demandops.model.ledger.claim import Claim, path_of
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
 

@@ -249,7 +249,7 @@ def policy_warnings(world: World) -> Iterator[Fault]:
         yield fault("", f"'{node.id}': {message}").within(file)
     for id in config.drained_nodes:
         if world.ledger.applications_on.get(id):
-            drain = with_moves(Drain(id), world, whole_usage(world), all_names(world))
+            drain = with_moves(Drain(id=id), world, whole_usage(world), all_names(world))
             file = config.file_of(NODES_FILE, config.host_of(id))
             for text in (*drain.moved, *drain.stays):
                 yield fault("", f"'{id}' is drained: {text}").within(file)

@@ -20,7 +20,7 @@ from demandops.detect.condition import Count, FieldPath, Hours, Near, Threshold,
 from demandops.model.config import base_model
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text
 from demandops.model.config.policy import Duration, Patterns, matches
-from demandops.model.demand import demand_goal, deployment_request_goal
+from demandops.model.demand.goals import form_faults
 
 # ---- the template of a demand: plain data in whose texts ``{entity}`` stands for a value ----
 #
@@ -241,10 +241,10 @@ def faults_of_demand(
     data = filled(template.data, _SAMPLE)
     if template.action == "demand":
         fixed = [name for name in ("apiVersion", "kind", "operation") if name in data]
-        malformed = demand_goal.parse({**_HEAD, **data})[1]
+        malformed = form_faults({**_HEAD, **data})
     else:
         fixed = ["shutdown"] if "shutdown" in data else []
-        malformed = deployment_request_goal.form_faults(data)
+        malformed = form_faults(data)
     problems = [fault(f"{field}.{name}", "is set by the detector; remove it") for name in fixed]
     written = dict(texts(template.data, field))
     for problem in malformed:

@@ -13,7 +13,6 @@ from demandops.model.config.override import UNSHAPED, Shaping
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ApplicationVersion, ChartSource, Image
 from demandops.model.demand.demand import InputTopic
-from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
 

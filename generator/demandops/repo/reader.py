@@ -19,6 +19,7 @@ from demandops.decide.changeset import FileReader
 from demandops.decide.rollback import Restoration
 from demandops.decide.state import rendered_files
 from demandops.model.config.config import Config
+from demandops.model.demand.demand import Rollback
 from demandops.repo import verification
 from demandops.repo.git import tree as trees
 from demandops.repo.git.local_repository import LastFetch, connect, is_url
@@ -243,8 +244,8 @@ class Reader:
         people = commit_log.person_commits(self._objects, follows, since)
         return [commit_log.entry_of(commit) for commit in islice(people, most)]
 
-    def restoration(self, to: str, **more: object) -> Restoration:
-        return ledger_files.restoration(self._objects, to, **more)
+    def restoration(self, rollback: Rollback) -> Restoration:
+        return ledger_files.restoration(self._objects, rollback)
 
     def operator(self) -> Person:
         return commit_message.operator(self._objects.path)

@@ -157,11 +157,13 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str |
     written = dict[str, str | None]()
     for path, text in files.items():
         new: str | None = text
-        if path.startswith(f"{records.REPLICAS_ROOT}/"):
+        if path.startswith(tuple(f"{root}/" for root in records.GONE_ROOTS)):
             new = None
         elif claim_files.kind_of(path) is not None:
             claim = ledger.get(claim_files.read(text, path).key)
             new = claim_files.text_of(claim) if claim else text
+        elif waiting := records.read_waiting(text, path):
+            new = records.waiting_text(waiting)
         elif records.read_ended_override({path: text}):
             new = strict_yaml.set_key(text, "apiVersion", LEDGER_API_VERSION)
         if new != text:

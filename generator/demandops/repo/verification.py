@@ -9,7 +9,12 @@ import pygit2
 from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.base.errors import InvalidInput, StateRepoError
-from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
+from demandops.base.settings import (
+    GENERATED_ROOTS,
+    LEDGER_API_VERSION,
+    NOTES_ROOT,
+    RENDER_VERSION,
+)
 from demandops.decide.planning.planner import TracedPlan
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.decide.state import State, rendered_files
@@ -33,8 +38,8 @@ from demandops.repo.load import ledger_files, state_in_effect
 # A commit of the generator may change generated files, reports, and the claims that its message
 # names. Some operations may change further files.
 
-# The folders of the ledger that have records, such as recent shutdowns, instead of claims.
-_RECORDS = tuple(f"{root}/" for root in (records.MARKERS_ROOT, records.SHUTDOWNS_ROOT))
+# No decision depends on what is below these.
+_GONE = tuple(f"{root}/" for root in records.GONE_ROOTS)
 # Operations that may rewrite a claim, to start its lease or to change its schema.
 _REWRITING = ("follow", "upgrade")
 # Operations that may add or remove the marker of an ended override.
@@ -57,12 +62,16 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
             continue
         if operation == "upgrade" and (path == ROOT_FILE or _only_removes_ignored(commit, path)):
             continue
+        if path.startswith(_GONE):
+            continue
         if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
             continue
         if root != claim_files.LEDGER_ROOT:
             yield path
-        elif path.startswith(_RECORDS):
-            if not _may_record(commit, path, operation):
+        elif path.startswith(f"{records.MARKERS_ROOT}/"):
+            text = trees.read_text(commit.tree, path) or ""
+            is_valid = not text or records.read_ended_override({path: text})
+            if operation not in _ENDING or not is_valid:
                 yield path
         elif path.rsplit("/", 1)[-1] in named:
             if blob and not _is_canonical(commit, path):
@@ -72,10 +81,8 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
 
 
 def _only_removes_ignored(commit: Commit, path: str) -> bool:
-    # fields of a definition, and records that earlier versions wrote
+    # fields of a definition that are read no longer
     before, after = (trees.read_text(tree, path) for tree in (commit.parents[0].tree, commit.tree))
-    if path.startswith(f"{records.REPLICAS_ROOT}/"):
-        return after is None
     return before is not None and without_ignored_fields(path, before) == after
 
 
@@ -92,20 +99,13 @@ def _only_rewrites(commit: Commit, path: str) -> bool:
 
 
 def _is_canonical(commit: Commit, path: str) -> bool:
-    if path.startswith(f"{records.WAITING_ROOT}/"):
-        text = trees.read_text(commit.tree, path) or ""
-        waits = records.read_waiting(text, path)
-        return waits is not None and records.waiting_text(waits) == text
-    claim = ledger_files.valid_claim_at(commit.tree, path)
-    return claim is not None and claim_files.text_of(claim) == trees.read_text(commit.tree, path)
-
-
-def _may_record(commit: Commit, path: str, operation: str) -> bool:
     text = trees.read_text(commit.tree, path) or ""
-    if path.startswith(f"{records.MARKERS_ROOT}/"):
-        is_valid = not text or bool(records.read_ended_override({path: text}))
-        return operation in _ENDING and is_valid
-    return operation in ("shutdown", "join", "rollback")
+    is_older = LEDGER_API_VERSION not in text
+    if path.startswith(f"{records.WAITING_ROOT}/"):
+        waits = records.read_waiting(text, path)
+        return waits is not None and (is_older or records.waiting_text(waits) == text)
+    claim = ledger_files.valid_claim_at(commit.tree, path)
+    return claim is not None and (is_older or claim_files.text_of(claim) == text)
 
 
 # ---- rendering the files again, and comparing them with the committed ones ----

@@ -208,4 +208,3 @@ class Generator:
 
     def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
         return self.stop(timeout).result()
-

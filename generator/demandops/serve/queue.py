@@ -262,4 +262,3 @@ def _next_in(lane: deque[_Queued]) -> _Queued | None:
     while lane and lane[0].has_left:
         lane.popleft()
     return lane[0] if lane else None
-

@@ -106,9 +106,9 @@ def bookkeeping(world: World) -> Bookkeeping:
             for role, topics in release.inputs.items()
         }
         for claim in claims_of(release, active.ledger):
-            for role, topic, key in demanded_inputs(active, release, claim.application):
+            for role, topic in demanded_inputs(active, release, claim.application):
                 if topic in inputs[role]:  # a claim that a person wrote may name another topic
-                    inputs[role][topic].update(claim.holders(key))
+                    inputs[role][topic].update(claim.requesters)
         services[release.name] = ServiceEntry(
             applications=list(release.applications),
             service=release.key.service,
@@ -126,15 +126,15 @@ def bookkeeping(world: World) -> Bookkeeping:
         first, claims = active.ledger.connection(id), active.ledger.connection_claims(id)
         if first is None or not claims:
             continue
-        holders = {route.source: set[str]() for route in connection_topics(claims)}
+        requesters = {route.source: set[str]() for route in connection_topics(claims)}
         for claim in claims:
-            for key in claim.held.topic_keys():
-                holders[key[0]].update(claim.holders(key))
+            for route in claim.connection.topics:
+                requesters[route.source].update(claim.requesters)
         connections[id] = ConnectionEntry(
             type=first.type.word if first.type else "",
             source=first.source,
             target=first.target,
-            topics=_sorted(holders),
+            topics=_sorted(requesters),
             requesters=list(requesters_of(claims)),
         )
     suspended = [
@@ -153,7 +153,7 @@ def bookkeeping(world: World) -> Bookkeeping:
             demand.demand,
             list(demand.requesters),
             demand.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
-            demand.priority,
+            demand.put.priority,
         )
         for demand in in_turn(world.ledger.waiting)
     ]

@@ -94,8 +94,8 @@ def waiting_demand(demand: WaitingDemand) -> HeldDemand:
     return HeldDemand(
         name=demand.demand,
         state="waiting",
-        requests=(demand.request,),
-        requesters=tuple(sorted(demand.requesters)),
+        requests=(demand.put.id,),
+        requesters=demand.requesters,
         since=demand.since,
     )
 

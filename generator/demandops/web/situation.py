@@ -120,7 +120,7 @@ class CommitState:
         for was, now in ((change.before, change.after) for change in changes):
             # the page shows requesters, but `affected_keys` omits a release whose file stays the
             # same although its requesters changed
-            if was and now and (was.requesters, was.partial) != (now.requesters, now.partial):
+            if was and now and was.requesters != now.requesters:
                 keys.update(release_keys.keys_of_claims(self.active, [now]))
         planned = before.planned | dict(self._with_other_claims(before, subjects))
         for key in keys:

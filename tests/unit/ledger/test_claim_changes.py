@@ -41,7 +41,7 @@ def joined(ledger: Ledger, who: str = "v", **changed: Any) -> Ledger:
 def test_a_renewed_lease_only_renews_and_a_shutdown_does_not() -> None:
     ledger, new = applied(Ledger(), Join("r", item("v", "w")), 0)
     ledger, again = applied(ledger, Join("r", item("v", "w")), 1)
-    _, less = applied(ledger, Shutdown("r", item("v")), 2)
+    _, less = applied(ledger, Shutdown("r", item("v", "w")), 2)
     renews = [change.only_renews for changes in (new, again, less) for change in changes.claims]
     assert renews == [False, True, False]
 

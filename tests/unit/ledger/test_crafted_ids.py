@@ -29,7 +29,8 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import Changes
-from demandops.model.ledger.records import RecentShutdown, RecentShutdowns, Wait, WaitingDemand
+from demandops.model.ledger.records import Wait, WaitingDemand
+from demandops.model.release import ServiceKey
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -137,13 +138,11 @@ def test_whatever_the_ids_each_has_its_own_names_and_files_or_is_refused(
         assert_apart(repo)
     for request in taken:
         repo.take(end_of(request))
-        repo.forget_shutdowns()
         assert_apart(repo)
     assert not repo.rendered()
     for request in refused:
         assert outcome(repo.take(request)) == outcome(MemoryRepo().take(request))
         repo.take(end_of(request))
-        repo.forget_shutdowns()
 
 
 def conflicts(repo: MemoryRepo, asked: Goal) -> list[str]:
@@ -190,12 +189,6 @@ def test_two_waiting_demands_have_two_files() -> None:
     assert faults(records.waiting_text(one)) == ["conflict"]
 
 
-def test_a_shutdown_repeats_only_one_by_the_same_requesters() -> None:
-    known = RecentShutdown("0" * 20, "leave", ("vehicle00",), NOW)
-    shutdowns = RecentShutdowns().replace(known.digest, known)
-    assert shutdowns.earlier(known) == known
-    assert shutdowns.earlier(replace(known, requesters=("vehicle01",))) is None
-    assert shutdowns.earlier(replace(known, request="other")) is None
 
 
 def rivals_at(node: str) -> str:

@@ -168,7 +168,6 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
         assert all(ROS_TOPIC.fullmatch(topic) for topic in produced)
     shutdown = repo.take({**request, "shutdown": True})
     assert isinstance(shutdown, Decision), shutdown
-    repo.forget_shutdowns()
     assert repo.files == with_nodes(nodes).files
 
 

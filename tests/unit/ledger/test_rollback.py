@@ -54,11 +54,9 @@ def refusal(repo: MemoryRepo, request: Restoration, state: State | None = None) 
 @pytest.mark.parametrize("seed", range(3))
 def test_books_and_files_are_what_they_were(seed: int) -> None:
     repo = filled(seed)
-    repo.forget_shutdowns()
     then, files = repo.state.ledger, dict(repo.files)
     for request in Maker(Random(seed + 100)).sequence(12):
         repo.take(request)
-    repo.forget_shutdowns()
     decision = rolled_back(repo, back_to(then, drop_newer=True))
     assert dict(decision.state.ledger.claims) == dict(then.claims)
     after = repo.files | decision.files

@@ -22,13 +22,13 @@ from demandops.cli.target import dry_run_option, names_of, signing_option, writa
 from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision, decide
 from demandops.model.config.config import CONFIG_ROOTS
-from demandops.model.demand.demand import Decommission
+from demandops.model.demand import goals
+from demandops.model.demand.demand import Decommission, Demand, Rollback
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo import reader
 from demandops.repo.history import commit_message
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
-from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 from demandops.serve.queue import Receipt
 
@@ -42,8 +42,8 @@ def await_answer(future: Future[Any]) -> None:
         wait([future], timeout=0.5)
 
 
-def booked(generator: Generator, goal: Json) -> Receipt:
-    ticket = generator.submit(goal)
+def booked(generator: Generator, demand: Demand) -> Receipt:
+    ticket = generator.submit(demand)
     with busy("booking"):
         await_answer(ticket.future)
     return ticket.future.result()
@@ -146,7 +146,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     """
     chosen = frozenset([kinds] if kinds else ["node", "requester"])
     by = commit_message.operator()
-    goal = decommission_of(name, chosen, str(by), reason)
+    goal = goals.decommission(name, chosen, str(by), reason)
     if dry_run or person_change.is_asked(yes, output):
         row = _dry_run_decommission(goal, state_repo, output)
         show(output, row, _decommission_lines(row, True))
@@ -166,7 +166,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     show(output, row, _decommission_lines(row, False))
 
 
-def _dry_run_decommission(goal: Json, state_repo: str, output: str) -> Json:
+def _dry_run_decommission(goal: Decommission, state_repo: str, output: str) -> Json:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(progress=report)
         try:
@@ -180,20 +180,22 @@ def _dry_run_decommission(goal: Json, state_repo: str, output: str) -> Json:
     return _row(goal, decision.outcome, None, decision.changes.claims)
 
 
-def _is_unclaimed_node(error: Refused, goal: Json, snapshot: Snapshot) -> bool:
+def _is_unclaimed_node(error: Refused, goal: Decommission, snapshot: Snapshot) -> bool:
     # a node that holds nothing is no error; any other name that holds nothing may be misspelled
     codes = {fault.code for fault in error.faults}
-    return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
+    return codes == {"not-held"} and goal.id in snapshot.state.config.nodes
 
 
-def _row(goal: Json, outcome: str, commit: str | None, changes: Iterable[ClaimChange]) -> Json:
+def _row(
+    goal: Decommission, outcome: str, commit: str | None, changes: Iterable[ClaimChange]
+) -> Json:
     claims = [
         claim_data(change.before)
         | {"left": list(change.after.requesters) if change.after else None}
         for change in changes
         if change.before
     ]
-    return {"name": goal["name"], "outcome": outcome, "commit": commit, "claims": claims}
+    return {"name": goal.id, "outcome": outcome, "commit": commit, "claims": claims}
 
 
 def _decommission_lines(row: Json, dry_run: bool) -> Iterator[str]:
@@ -259,7 +261,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     with reader.opened(state_repo, only_read=dry_run) as repo:
         to, base = repo.commit(revision), repo.commit()
         who = repo.operator() if dry_run else person_change.warned_if_unnamed(repo.operator())
-        goal = rollback_to(to, drop_newer=drop_newer, reason=reason, who=who)
+        goal = goals.rollback(to, drop_newer=drop_newer, reason=reason, who=who)
         result: Json = {"to": to, "outcome": "refused", "commit": None}
         since = repo.changed_files(to, base, CONFIG_ROOTS)
         result |= {**_consequences(None), "configuration_since": since, "faults": []}
@@ -279,10 +281,10 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
         raise click.exceptions.Exit(1)
 
 
-def _dry_run_rollback(repo: Reader, goal: Json, base: str) -> Json:
+def _dry_run_rollback(repo: Reader, goal: Rollback, base: str) -> Json:
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(base, report).state
-    request = repo.restoration(goal["to"], drop_newer=goal["dropNewer"])
+    request = repo.restoration(goal)
     decision = decide(state, request, REAL.now(), repo.file_reader(base))
     return {"outcome": decision.outcome, **_consequences(decision)}
 
@@ -298,7 +300,7 @@ def _consequences(decision: Decision | None) -> Json:
     return {**claims, "releases": [asdict(release) for release in releases]}
 
 
-def _roll_back(state_repo: str, goal: Json, signing_key: Path | None, base: str) -> Json:
+def _roll_back(state_repo: str, goal: Rollback, signing_key: Path | None, base: str) -> Json:
     """Return the outcome, and the consequences if they are not those on ``base``."""
     try:
         with started_generator(state_repo, signing_key) as generator:

@@ -26,9 +26,8 @@ from demandops.cli.changes.ledger_change import started_generator
 from demandops.cli.json_output import Json, faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
-from demandops.decide.admission.admitted_request import admit, form_faults
 from demandops.decide.decision import decide
-from demandops.model.demand.goals import is_demand_goal
+from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
 from demandops.serve.approvals.proposal import parse_waiting_text
 from demandops.serve.generator import Generator
@@ -147,7 +146,7 @@ def request(
     if not documents:
         raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
     if any(form_faults(document.goal) for document in documents):
-        rows = _unbooked(documents, state_repo)
+        rows = [_unbooked(index, document) for index, document in enumerate(documents)]
     elif dry_run:
         rows = _dry_run(documents, state_repo, output)
     else:
@@ -182,20 +181,10 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> Json:
     } | more
 
 
-def _unbooked(documents: list[Document], state_repo: str) -> list[Json]:
-    with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
-        state = repo.snapshot(progress=report).state
-    rows = []
-    for index, document in enumerate(documents):
-        message = "not booked, because another request of the same command cannot be parsed"
-        refusal = InvalidInput([fault("", message)])
-        if form_faults(document.goal):
-            try:
-                admit(state, document.goal)
-            except InvalidInput as error:
-                refusal = error
-        rows.append(_refused(index, document, refusal))
-    return rows
+def _unbooked(index: int, document: Document) -> Json:
+    message = "not booked, because another request of the same command cannot be parsed"
+    faults = form_faults(document.goal) or [fault("", message)]
+    return _refused(index, document, InvalidInput(faults))
 
 
 def _refused(index: int, document: Document, error: DemandOpsError) -> Json:

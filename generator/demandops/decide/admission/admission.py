@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain
 
-from demandops.model.demand.goals import ITEMS, too_large
 from demandops.base.errors import Fault, fault, suggestion
 from demandops.base.naming import id_problem, topic_problem
 from demandops.base.quoting import quoted
@@ -22,6 +21,7 @@ from demandops.model.config.appdef import ApplicationDefinition, Services
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.repo_settings import Limits
 from demandops.model.demand.demand import LONGEST_S, AnyDemand, Application, Delivery, Demand, Item
+from demandops.model.demand.goals import ITEMS, too_large
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
 

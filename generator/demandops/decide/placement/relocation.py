@@ -9,7 +9,6 @@ from functools import partial, reduce
 from itertools import islice
 from math import inf
 
-from demandops.model.demand.demand import Demand
 from demandops.base.errors import Fault, sentences
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
@@ -27,7 +26,7 @@ from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.rollback import Restoration, request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.override import Override, format_time
-from demandops.model.demand.demand import Application, InputTopic, Item, Requirement
+from demandops.model.demand.demand import Application, Demand, InputTopic, Item, Requirement
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim, ClaimKey, requesters_of
@@ -365,7 +364,7 @@ def _faults(
             yield from collisions.faults_of_claim(change.after, before, after)
             yield from _brought_twice(change.after, after)
     keys = affected_keys(before, after, changes)
-    yield from collisions.name_faults(Drain(""), before, after, keys, Changes(changes), names)
+    yield from collisions.name_faults(Demand("drain"), before, after, keys, Changes(changes), names)
 
 
 def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias, TypeGuard, TypeVar, cast
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import Refused, suggestion
-from demandops.base.naming import Subject, TopicKey
+from demandops.base.naming import Subject
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection, ConnectionType, Route
 from demandops.connections.connection_types import route_faults
@@ -82,15 +82,6 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         giving = [claim for claim in claims if name in claim.application.parameters]
         parameters[name] = _merged_value(name, parameter, giving) if giving else parameter.default
     requesters = requesters_of(claims)
-    if service.roots:
-        # A claim may hold many topics, and each topic has holders of its own. Only the holders of
-        # the topics for which this instance runs are its requesters.
-        holders = (
-            claim.holders(topic)
-            for claim in claims
-            for topic in roots_of(claim.application, service, key)
-        )
-        requesters = tuple(sorted({who for names in holders for who in names}))
     further = service.root is not None and parts[0].inputs[service.root][0].further
     applications = tuple(dict.fromkeys(app.id for app in apps))
     version = release_keys.version_of_service(world, service, applications)
@@ -157,8 +148,8 @@ def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str
 
 def demanded_inputs(
     world: World, release: ServiceRelease, app: Application
-) -> Iterator[tuple[str, str, TopicKey]]:
-    """Yield (role, topic, root) for each topic that a service reads for an application."""
+) -> Iterator[tuple[str, str]]:
+    """Yield (role, topic) for each topic that a service reads for an application."""
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)
     if service.roots:
@@ -171,7 +162,7 @@ def demanded_inputs(
     for role in service.inputs:
         origin = _origin(world.config, key, role, app)
         for published in topics_of_origin(world.config, app, origin):
-            yield role, published.topic.topic, published.root
+            yield role, published.topic.topic
 
 
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:

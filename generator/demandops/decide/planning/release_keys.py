@@ -215,7 +215,7 @@ def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim |
     is_same = replace(new, inputs=old.inputs) == old
     if not is_same or old.parameters:  # a parameter's value may depend on the booking times
         return before, after
-    if (before.requesters, before.partial) != (after.requesters, after.partial):
+    if before.requesters != after.requesters:
         # Other requesters change a release only if an override selects by them, or a service
         # definition derives the number of replicas from them.
         selectors = (selector for override in world.overrides for selector in override.select)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from datetime import datetime, timezone
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from functools import lru_cache
+from typing import Annotated, Any, Literal, TypeVar, cast, get_args
 
 from pydantic import (
     AfterValidator,
@@ -16,6 +17,7 @@ from pydantic import (
     PlainSerializer,
     PlainValidator,
     StringConstraints,
+    TypeAdapter,
     ValidationError,
 )
 from pydantic.alias_generators import to_camel
@@ -160,6 +162,20 @@ Approval = Literal["none", "required"]
 # The configuration of a part that is a dataclass: pydantic reads it from a mapping, with no other
 # fields, and :func:`plain` writes it. Code makes copies of it without any check.
 PART = ConfigDict(extra="forbid")
+
+
+_AS_WRITTEN: Any = {"mode": "json", "by_alias": True, "exclude_defaults": True}
+
+
+@lru_cache(maxsize=64)
+def _adapter(model: Hashable) -> TypeAdapter[Any]:
+    return TypeAdapter(model)
+
+
+def plain(part: object) -> dict[str, Any]:
+    """Return a part as plain data, without the fields that have their defaults."""
+    data: dict[str, Any] = _adapter(cast(Hashable, type(part))).dump_python(part, **_AS_WRITTEN)
+    return data
 
 
 def _number(value: object) -> object:

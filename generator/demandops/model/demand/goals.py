@@ -9,9 +9,9 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, PlainValidator, ValidationError
 
@@ -29,6 +29,7 @@ from demandops.model.demand.demand import (
     Application,
     Decommission,
     Demand,
+    Held,
     InputTopic,
     Item,
     Rollback,
@@ -105,7 +106,10 @@ class DemandGoal(FrozenModel):
 
     def read(self) -> Demand:
         requesters = tuple(self.requesters)
-        lists = (("applications", self.applications), ("connections", self.connections))
+        lists: tuple[tuple[str, tuple[Held, ...]], ...] = (
+            ("applications", self.applications),
+            ("connections", self.connections),
+        )
         return Demand(
             self.operation,
             self.request or self.demand,
@@ -122,10 +126,10 @@ class DemandGoal(FrozenModel):
         )
 
 
-def _named(held: Application | Connection) -> Application | Connection:
-    # the services whose node the demand names
-    is_application = isinstance(held, Application)
-    return replace(held, named=tuple(sorted(held.services))) if is_application else held
+def _named(held: Held) -> Held:
+    if not isinstance(held, Application):
+        return held
+    return replace(held, named=tuple(sorted(held.services)))  # those whose node the demand names
 
 
 # What the generator records of an application and its inputs, which a demand cannot give.
@@ -320,7 +324,15 @@ _NOT_A_MAPPING = (
     "a request is a mapping with the fields of a Demand (kind, demand, requesters and so on), or "
     "with id, apps, connections and shutdown"
 )
-_Model = TypeVar("_Model", DemandGoal, WireGoal)
+
+
+def form_faults(goal: object) -> Sequence[Fault]:
+    """Return the faults of a goal that need no configuration, such as unknown fields."""
+    try:
+        read_goal(goal)
+    except Refused as refused:
+        return refused.faults
+    return ()
 
 
 def is_demand_goal(goal: dict[str, Any]) -> bool:
@@ -358,7 +370,9 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
     return replace(demand, goal=goal)
 
 
-def _parsed(model: type[_Model], goal: dict[str, Any], faults: list[Fault]) -> Demand:
+def _parsed(
+    model: type[DemandGoal | WireGoal], goal: dict[str, Any], faults: list[Fault]
+) -> Demand:
     try:
         parsed = model.model_validate(goal)
     except ValidationError as error:

@@ -9,19 +9,19 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, TypeAdapter
+from pydantic import AfterValidator, Field
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput
-from demandops.base.naming import Subject, SubjectKind
+from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.base.settings import LEDGER_API_VERSION
 from demandops.connections.connection import Connection
-from demandops.model.config.base_model import FrozenModel, Moment, parse, time_text
+from demandops.model.config.base_model import FrozenModel, Moment, parse, plain, time_text
 from demandops.model.demand.demand import Application, Held, Lease
 
 # The prefix of the demand ids of claims that overrides make; no other demand may use it
@@ -87,6 +87,10 @@ class Claim:
     def extending(self, current: Claim) -> Claim:
         # with everything added that the claim so far holds
         return replace(self, held=current.held.extended(self.held).booked())  # type: ignore[arg-type]
+
+    def without_topics(self, gone: Container[TopicKey]) -> Claim | None:
+        held = self.held.without_topics(gone)
+        return replace(self, held=held) if held else None
 
     def without_node(self, node: str) -> Claim | None:  # the claim must need the node
         held = self.held.without_node(node)
@@ -163,20 +167,13 @@ class _ClaimFile(FrozenModel):
     connection: Connection | None = None
 
 
-_APPLICATION, _CONNECTION = TypeAdapter(Application), TypeAdapter(Connection)
-_LEASE = TypeAdapter(Lease)
-_OPTIONS: Any = {"mode": "json", "by_alias": True, "exclude_defaults": True}
-
-
 def text_of(claim: Claim) -> str:
-    held = claim.held
-    if isinstance(held, Application):
-        data = _APPLICATION.dump_python(held, **_OPTIONS)
+    data = plain(claim.held)
+    if claim.is_on_application:
         for name in ("inputs", "parameters", "services", "moved"):
             if name in data:
                 data[name] = dict(sorted(data[name].items()))
     else:
-        data = _CONNECTION.dump_python(held, **_OPTIONS)
         for route in data["topics"]:
             if route["source"] == route["target"]:
                 del route["target"]
@@ -189,7 +186,7 @@ def text_of(claim: Claim) -> str:
             "requesters": list(claim.requesters),
             "booked": time_text(claim.booked),
             **({"action": "DeploymentRequest"} if claim.joined else {}),
-            **({"lease": _LEASE.dump_python(claim.lease, **_OPTIONS)} if claim.lease else {}),
+            **({"lease": plain(claim.lease)} if claim.lease else {}),
             "application" if claim.is_on_application else "connection": data,
         }
     )

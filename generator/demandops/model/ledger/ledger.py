@@ -305,7 +305,7 @@ class ClaimChange:
 @dataclass(frozen=True, slots=True)
 class Changes:
     claims: tuple[ClaimChange, ...] = ()
-    # in words, what a shutdown lists, but its requesters do not hold
+    # in words, what a shutdown lists, but its claim does not hold
     not_held: tuple[str, ...] = ()
     # the ids of the demands that begin or cease to wait, or that now wait with another goal
     waiting: tuple[str, ...] = ()

@@ -19,9 +19,8 @@ from demandops.model.demand.demand import Demand, Operation
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.claim import LEDGER_ROOT, segment
 
-# Earlier versions recorded here for how long a service kept replicas that no demand needed. Such
-# files are ignored, and `demandops upgrade` deletes them.
-REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
+# Folders of records that earlier versions wrote: ignored, and removed by ``demandops upgrade``
+GONE_ROOTS = (f"{LEDGER_ROOT}/replicas", f"{LEDGER_ROOT}/shutdowns")
 
 # ---- waiting demands, which the ledger keeps until a node has room ----
 #

@@ -149,7 +149,7 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
             f"{request.by} rolled the ledger back to commit {to}, which changes {what}: "
             f"{request.reason}"
         )
-    if isinstance(request, Expire):
+    if request.operation == "expire":
         claims = [change.before for change in changes]
         last = max(claim.lease.expires_at for claim in claims if claim and claim.lease)
         return f"Expire {subjects}", (

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 
 from pygit2 import Oid, Repository, Tree
 
-from demandops.model.demand.demand import Rollback
 from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.naming import Subject
 from demandops.decide.rollback import Restoration
-from demandops.model.demand.demand import Lease
+from demandops.model.demand.demand import Lease, Rollback
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import Claim, ClaimKey
 from demandops.model.ledger.ledger import ClaimChange, Ledger

@@ -76,9 +76,8 @@ def load(
     if files.faults:
         raise InvalidInput(files.faults)
     ended = last_valid_config.ended_overrides_at(commit.tree)
-    shutdowns = records.read_all_shutdowns(trees.texts(commit.tree, (records.SHUTDOWNS_ROOT,)))
     waits = records.read_all_waiting(trees.texts(commit.tree, (records.WAITING_ROOT,)))
-    ledger = replace(files.ledger(), ended=ended, shutdowns=shutdowns, waiting=waits)
+    ledger = replace(files.ledger(), ended=ended, waiting=waits)
     return Snapshot(commit.id, State(config, ledger, EVALUATE), commit.id)
 
 
@@ -114,14 +113,10 @@ def advance(
     config_changed = (
         world_changed or not before.is_rendered or _must_render_all(repo, before.commit, to)
     )
-    shutdowns, waits = state.ledger.shutdowns, state.ledger.waiting
-    for path, _ in trees.differences(old, new, (records.SHUTDOWNS_ROOT,)):
-        text = trees.read_text(new, path)
-        shutdown = records.read_shutdowns(text, path) if text is not None else None
-        shutdowns = shutdowns.replace(records.digest_in(path), shutdown)
+    waits = state.ledger.waiting
     if trees.differ(old, new, (records.WAITING_ROOT,)):
         waits = records.read_all_waiting(trees.texts(new, (records.WAITING_ROOT,)))
-    ledger = replace(state.ledger, ended=ended, shutdowns=shutdowns, waiting=waits)
+    ledger = replace(state.ledger, ended=ended, waiting=waits)
     state = State(config, ledger, EVALUATE) if in_effect.config else replace(state, ledger=ledger)
     problems, claims, invalid = list(in_effect.faults), dict[str, Claim | None](), list[str]()
     # a quarantined file is read again, because another change may have made it valid

@@ -212,7 +212,7 @@ class CommitBatch:
 
     def drain(self, node: str, after: str, operation: str, now: datetime) -> Decision:
         # it begins with the application that follows ``after``; if none can move, nothing changes
-        decision = decide(self.head.state, Drain(node, after=after), now, self.read)
+        decision = decide(self.head.state, Drain(id=node, after=after), now, self.read)
         if decision.files:
             # the author is the person who last changed the node's file, and so drained the node
             config = decision.state.config

@@ -106,9 +106,7 @@ class WaitingTurns:
                 continue
             checkpoint = within(state.config.repo_settings.limits, self._runtime)
             try:
-                decision = decide(
-                    state, waiting.put, now, commits.read, checkpoint=checkpoint
-                )
+                decision = decide(state, waiting.put, now, commits.read, checkpoint=checkpoint)
             except InvalidInput as error:
                 log.debug("demand %s still waits: %s", quoted(demand), error)
                 if isinstance(error, OverLimit):  # a template took too long, and the next may too

@@ -54,7 +54,9 @@ class LeaseExpiry:
         return [self._ticket(demand, now) for demand in ended if demand not in self._tried]
 
     def _ticket(self, demand: str, now: datetime) -> Ticket:
-        ticket = Ticket(self._runtime.fresh_id(), Demand("expire", demand, demand=demand, is_complete=True), now)
+        ticket = Ticket(
+            self._runtime.fresh_id(), Demand("expire", demand, demand=demand, is_complete=True), now
+        )
 
         def tell(future: Future[Receipt]) -> None:
             self._tried[demand] = now
