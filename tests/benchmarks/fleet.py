@@ -18,10 +18,11 @@ from typing import Any
 
 import pygit2
 from demandops.base import strict_yaml
-from demandops.decide.admission.admitted_request import admit
 from demandops.decide.booking import apply
+from demandops.decide.decision import admit
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.load import load
+from demandops.model.demand.goals import read_goal
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.history import commit_message
@@ -127,7 +128,7 @@ def _lay_down(path: Path, edges: int, vehicles: int, further: int) -> None:
     ledger = Ledger()
     for number in range(edges):
         for place in range(vehicles):
-            request = admit(state, goal(edge_id(number), vehicle_id(number, place)))
+            request = admit(state, read_goal(goal(edge_id(number), vehicle_id(number, place))))
             ledger, _ = apply(ledger, request, now)
     files |= {claim_files.path_of(claim.key): claim_files.text_of(claim) for claim in ledger}
     files |= rendered_files(State(config, ledger, state.evaluate))

@@ -220,8 +220,6 @@ def marker(data: bytes) -> None:
     records.read_ended_override({records.ended_override_path("x"): _text(data)})
 
 
-
-
 def waiting_demand(data: bytes) -> None:
     path = records.waiting_path("x")
     record = records.read_waiting(_text(data), path)
@@ -322,7 +320,7 @@ def revision(data: bytes) -> None:
 def moment(data: bytes) -> None:
     text = _text(data)
     for read, form in (
-        (claim_files.parse_timestamp, claim_files.format_timestamp),
+        (base_model.parse_timestamp, base_model.time_text),
         (override.parse_time, override.format_time),
         (base_model.seconds_of, "{}s".format),
     ):

@@ -26,7 +26,7 @@ from demandops.decide.state import try_configuration
 from demandops.model.config.base_model import parse_file
 from demandops.model.config.load import load
 from demandops.model.config.override import Override, OverrideFile
-from demandops.model.demand.demand_goal import _value_problem
+from demandops.model.demand.goals import _value_problem
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.history import commit_log, commit_message

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from demandops.cli.main import run as run_command
 from demandops.model.config.override import format_time
-from demandops.model.ledger.claim_file import read
+from demandops.model.ledger.claim import read
 from demandops.model.ledger.records import SHUTDOWNS_ROOT
 
 from tests.integration.conftest import On

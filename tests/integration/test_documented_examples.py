@@ -19,7 +19,7 @@ from demandops.decide.state import rendered_files
 from demandops.detect import rule_file
 from demandops.detect.detector import Detector
 from demandops.detect.observations import Observation
-from demandops.model.demand.demand_request import Expire
+from demandops.model.demand.demand import Demand
 from demandops.repo import new_repo
 from demandops.repo.history import commit_message
 from demandops.repo.merge_check.rendered_charts import manifest_faults
@@ -258,7 +258,7 @@ def test_the_versions_of_the_documentation_are_an_update_and_back() -> None:
     (application,) = second["applications"]
     upgrade = second | {"applications": [application | {"version": "2.0.0"}]}
     assert repo.decide(upgrade).approval == (block("versions.md", "application definition"),)
-    end = Expire(id=second["demand"], demand=second["demand"])
+    end = Demand("expire", demand=second["demand"], is_complete=True)
     said = [text.strip() for text in blocks("versions.md") if text.lstrip().startswith("Desired")]
     for goal, text in zip((second, end), said, strict=True):
         decision = repo.send(goal, repo.now + timedelta(minutes=20 if goal is end else 0))

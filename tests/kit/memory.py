@@ -18,6 +18,7 @@ from demandops.decide.decision import Decision, decide
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import Config
 from demandops.model.config.load import load
+from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim
@@ -85,6 +86,8 @@ class MemoryRepo:
         return self.state.config
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
+        if isinstance(goal, dict) and goal.get("kind") == "Decommission":
+            goal = read_journaled(goal)
         return decide(self.state, goal, now or self.now, self.files.get)
 
     def send(self, goal: object, now: datetime | None = None) -> Decision:

@@ -20,7 +20,8 @@ from demandops.decide.placement.relocation import changed_claim_files, following
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.base_model import FrozenModel, parse_file, seconds_of
 from demandops.model.config.load import load
-from demandops.model.demand.demand_request import Expire
+from demandops.model.demand.demand import Demand
+from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import in_turn
 from demandops.serve.timing.expiry import LeaseExpiry
@@ -181,6 +182,8 @@ class World(MemoryRepo):
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
         self._sent += 1
+        if isinstance(goal, dict) and goal.get("kind") == "Decommission":
+            goal = read_journaled(goal)
         operation, now = f"hand-in-{self._sent}", now or self.clock.now()
         return decide(
             self.state,
@@ -195,18 +198,18 @@ class World(MemoryRepo):
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
         done = list(dict.fromkeys(claim.demand for claim in claims))
         for demand in done:
-            taken = self.take(Expire(id=demand, demand=demand))
+            taken = self.take(Demand("expire", demand, demand=demand, is_complete=True))
             assert isinstance(taken, Decision)
             assert taken.files, f"nothing of '{demand}' was released at {now}"
         for node in self.config.drained_nodes:
             if self.state.ledger.applications_on.get(node):
-                self.take(Drain(node))
+                self.take(Drain(id=node))
         self.book_waiting()
         return done
 
     def book_waiting(self) -> None:
         for waiting in in_turn(self.state.ledger.waiting):
-            taken = self.take(dict(waiting.goal))
+            taken = self.take(waiting.put)
             assert isinstance(taken, Decision), taken
 
     def waiting(self) -> list[str]:

@@ -16,7 +16,7 @@ from demandops.base.errors import InvalidInput
 from demandops.connections import connection
 from demandops.connections.connection import ConnectionType, Route
 from demandops.decide import booking, changeset, decision
-from demandops.decide.admission import admitted_request, permission
+from demandops.decide.admission import completing, permission
 from demandops.decide.checks import quotas
 from demandops.decide.decision import Decision
 from demandops.decide.placement import placement, relocation
@@ -25,7 +25,7 @@ from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning import overrides, planner, release_keys
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Lease
-from demandops.model.ledger import claim, ledger
+from demandops.model.ledger import ledger
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.records import RecentShutdowns, Wait, WaitingDemand
 from demandops.repo.git.remote_repository import RemoteRepository
@@ -147,15 +147,15 @@ def count_sources_for_topics(
     return right(scaling, parameters, {topic.source: topic for topic in topics}.values(), *more)
 
 
-plant("share_one_instance", 1, admitted_request, "_separated", itself)
+plant("share_one_instance", 1, completing, "_separated", itself)
 
 
-@wrong(4, admitted_request, "_separated")
+@wrong(4, completing, "_separated")
 def move_instances_with_the_channel(separated: Any, app: Any, config: Any) -> Any:
     return replace(separated(app, config), version=app.version)
 
 
-@wrong(72, admitted_request, "_separated")
+@wrong(72, completing, "_separated")
 def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: Any) -> Any:
     made = separated(app, config)
     return made if made.separate else app
@@ -164,7 +164,7 @@ def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: An
 plant("take_the_first_domain", 1, Config, "nodes_of", lambda _, config, node: (node,))
 
 
-@wrong(100, admitted_request, "_chosen")
+@wrong(100, completing, "_chosen")
 def forget_what_is_booked_in_a_domain(chosen: Any, one: Any, booked: Any, *more: Any) -> Any:
     return chosen(one, {}, *more)
 

@@ -94,7 +94,7 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     """A decommission waits in the journal like any demand, so the next start carries it out."""
     generator = Generator(url)
     rig.book(generator, goal(1))
-    leaving = Decommission("vehicle01", kinds=frozenset({"node"}))
+    leaving = Decommission(id="vehicle01", kinds=frozenset({"node"}))
     with rig.away(bare):
         generator.submit(leaving.goal(), "op-leave")
         assert generator.close(timeout=0.3) is False

@@ -12,6 +12,7 @@ import pytest
 from demandops.base.errors import StateRepoError
 from demandops.cluster.health import Health
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
+from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
 from demandops.web import fleet_map, time_line
@@ -224,7 +225,7 @@ def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: F
 def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     newest = follower.newest
     since = newest.now - timedelta(minutes=5)
-    waiting = WaitingDemand("later", "later", ("vehicle02",), since, 0, {})
+    waiting = WaitingDemand(read_goal(goals.put("later", "vehicle02")), since)
     ledger = replace(newest.commit_state.state.ledger, waiting=HashTrieMap({"later": waiting}))
     now = changed(follower, ledger=ledger)
     (cause,) = causes(now, follower, "vehicle02")

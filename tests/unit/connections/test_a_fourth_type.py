@@ -120,7 +120,7 @@ def test_a_demand_for_it_becomes_a_claim_and_a_client(kind: str) -> None:
     (claim,) = world.state.ledger.connection_claims("c")
     assert claim.connection.type is RELAY
     path = claim_files.path_of(claim.key)
-    assert yaml.safe_load(world.files[path])["type"] == "relay"
+    assert yaml.safe_load(world.files[path])["connection"]["type"] == "relay"
     assert claim_files.read(world.files[path], path) == claim
     assert world.objects("Deployment").keys() == {"relay-edge"}
     (config,) = world.objects("ConfigMap").values()

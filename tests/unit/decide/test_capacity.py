@@ -98,7 +98,7 @@ def book_waiting(repo: MemoryRepo) -> list[str]:
     """Try to book each waiting demand in order; return the ids of those that were booked."""
     booked = []
     for one in in_turn(repo.state.ledger.waiting):
-        taken = repo.take(dict(one.goal))
+        taken = repo.take(one.put)
         assert isinstance(taken, Decision)
         booked += [one.demand] if taken.outcome == "booked" else []
     return booked
@@ -129,9 +129,9 @@ def test_no_node_gets_more_than_it_has_and_what_waits_does_not_fit_and_is_booked
         waiting = in_turn(repo.state.ledger.waiting)
         assert not waiting or when_full == "wait"
         for one in waiting:
-            assert one.goal == sent[one.demand]
+            assert one.put.goal == sent[one.demand]
             assert not repo.state.ledger.claims_of_demand(one.demand)
-            assert repo.decide(dict(one.goal)).outcome == "waiting"
+            assert repo.decide(one.put).outcome == "waiting"
         turns = [(-one.priority, one.since) for one in waiting]
         assert turns == sorted(turns)
         assert ledger_in(repo.files) == repo.state.ledger

@@ -137,7 +137,7 @@ def test_what_is_placed_fits_stays_and_leaves_drained_nodes(
         node = random.choice(NODES)
         configure(repo, with_gpus(plain, random, node))
         left, claims = places(repo), list(repo.state.ledger)
-        decision = repo.send(Drain(node))
+        decision = repo.send(Drain(id=node))
         for id, nodes in places(repo).items():
             for name, now in nodes.items():
                 told = f"service '{name}' of application '{id}'" if name else f"application '{id}'"
@@ -178,17 +178,17 @@ def on_cloud(count: int, *stuck: int) -> MemoryRepo:
 
 
 def test_what_leaves_a_node_is_spread_over_the_others() -> None:
-    moved = on_cloud(4).decide(Drain("cloud")).state.ledger
+    moved = on_cloud(4).decide(Drain(id="cloud")).state.ledger
     assert dict(moved.applications_on) == {"edge": 2, "vehicle01": 2}
 
 
 def test_a_drain_in_parts_moves_the_same_applications_and_skips_none() -> None:
     state = on_cloud(5, 0, 3).state
-    whole = with_moves(Drain("cloud"), state, state.usage(), state.names())
+    whole = with_moves(Drain(id="cloud"), state, state.usage(), state.names())
     assert len(whole.moved) == 3 and len(whole.stays) == 2 and not whole.last
-    parts = [with_moves(Drain("cloud"), state, state.usage(), state.names(), most=2)]
+    parts = [with_moves(Drain(id="cloud"), state, state.usage(), state.names(), most=2)]
     while after := parts[-1].last:
-        drain = Drain("cloud", after=after)
+        drain = Drain(id="cloud", after=after)
         parts.append(with_moves(drain, state, state.usage(), state.names(), most=2))
     assert len(parts) > 1
     stays = [text.split(",")[0] for part in parts for text in part.stays]

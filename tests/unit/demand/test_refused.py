@@ -15,7 +15,7 @@ import pytest
 import yaml
 from demandops.base import naming
 from demandops.base.errors import MOST_FAULTS, Fault, Refused, suggestion
-from demandops.model.demand import demand_goal
+from demandops.model.demand.goals import form_faults
 
 from tests.kit.goals import (
     BODY,
@@ -162,5 +162,5 @@ def test_names_are_made_once_for_each_of_many_topics() -> None:
 def test_a_json_text_that_cannot_be_read_is_told_why(written: str, told: str) -> None:
     made = put("d", "vehicle01")
     made["applications"][0]["parameters_json"] = {"rate": written}
-    (found,) = demand_goal.parse(made)[1]
+    (found,) = form_faults(made)
     assert told in found.message

@@ -17,7 +17,6 @@ from demandops.connections.ros import ROS
 from demandops.connections.zenoh import ZENOH
 from demandops.decide.booking import apply
 from demandops.model.demand.demand import Demand, Item, Term
-from demandops.model.demand.demand_request import Join, Release, Shutdown
 from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim
 from demandops.model.ledger.ledger import Changes, Ledger
 
@@ -27,7 +26,7 @@ HELD = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
 
 
 def item(*requesters: str, held: Connection = HELD) -> tuple[Item, ...]:
-    return (Item(held, requesters, "connections[0].{}".format, Term(60)),)
+    return (Item(held, requesters, term=Term(60)),)
 
 
 def applied(ledger: Ledger, request: Demand, minutes: int = 0) -> tuple[Ledger, Changes]:
@@ -35,13 +34,13 @@ def applied(ledger: Ledger, request: Demand, minutes: int = 0) -> tuple[Ledger, 
 
 
 def joined(ledger: Ledger, who: str = "v", **changed: Any) -> Ledger:
-    return applied(ledger, Join("r", item(who, held=replace(HELD, **changed))))[0]
+    return applied(ledger, Demand("join", "r", item(who, held=replace(HELD, **changed))))[0]
 
 
 def test_a_renewed_lease_only_renews_and_a_shutdown_does_not() -> None:
-    ledger, new = applied(Ledger(), Join("r", item("v", "w")), 0)
-    ledger, again = applied(ledger, Join("r", item("v", "w")), 1)
-    _, less = applied(ledger, Shutdown("r", item("v", "w")), 2)
+    ledger, new = applied(Ledger(), Demand("join", "r", item("v", "w")), 0)
+    ledger, again = applied(ledger, Demand("join", "r", item("v", "w")), 1)
+    _, less = applied(ledger, Demand("shutdown", "r", item("v", "w")), 2)
     renews = [change.only_renews for changes in (new, again, less) for change in changes.claims]
     assert renews == [False, True, False]
 
@@ -50,7 +49,7 @@ def test_a_refusal_suggests_no_claims_of_overrides() -> None:
     demands = (f"{OVERRIDE_PREFIX}keep", "mine")
     ledger = rebuilt(Claim(HELD, demand, "r", ("v",), NOW) for demand in demands)
     with pytest.raises(Refused, match=r"hold, for example, mine$"):
-        applied(ledger, Release("r", (), "mien", ("v",)))
+        applied(ledger, Demand("release", "r", (), "mien", ("v",)))
 
 
 def test_a_reverse_route_delivers_to_the_source() -> None:

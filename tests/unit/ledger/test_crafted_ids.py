@@ -25,12 +25,11 @@ from demandops.decide.planning import flows
 from demandops.decide.state import rendered_files
 from demandops.model.config.load import load
 from demandops.model.demand.demand import Requirement
-from demandops.model.ledger import claim as claim_files
+from demandops.model.demand.goals import read_goal
 from demandops.model.ledger import records
-from demandops.model.ledger.claim import ClaimKey, demand_id
+from demandops.model.ledger.claim import demand_id
 from demandops.model.ledger.ledger import Changes
 from demandops.model.ledger.records import Wait, WaitingDemand
-from demandops.model.release import ServiceKey
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -175,10 +174,8 @@ def test_two_nodes_have_two_folders() -> None:
 @pytest.mark.usefixtures("short_digests")
 def test_two_waiting_demands_have_two_files() -> None:
     other = rival("Van", records.waiting_path)
-    one, two = (
-        WaitingDemand(demand, "", ("vehicle00",), NOW, 0, put(demand)) for demand in ("Van", other)
-    )
-    request = Wait(id="", demand=other, waiting=two)
+    one, two = (WaitingDemand(read_goal(put(demand)), NOW) for demand in ("Van", other))
+    request = Wait(demand=other, waiting=two)
 
     def faults(text: str | None) -> list[str]:
         files = {records.waiting_path("Van"): text}
@@ -187,8 +184,6 @@ def test_two_waiting_demands_have_two_files() -> None:
 
     assert faults(None) == faults(records.waiting_text(two)) == []
     assert faults(records.waiting_text(one)) == ["conflict"]
-
-
 
 
 def rivals_at(node: str) -> str:
@@ -216,7 +211,7 @@ def test_a_name_that_is_taken_keeps_one_application_on_a_drained_node_and_no_oth
     repo.send(reading("x", rivals_at("edge"), node="edge"))
     cloud = repo.config.nodes["cloud"].model_copy(update={"drained": True})
     config = replace(repo.config, nodes={**repo.config.nodes, "cloud": cloud})
-    drained = decide(replace(repo.state, config=config), Drain("cloud"), NOW, repo.files.get)
+    drained = decide(replace(repo.state, config=config), Drain(id="cloud"), NOW, repo.files.get)
     assert isinstance(drained.request, Drain)
     assert [text.split("'")[1] for text in drained.request.moved] == ["b"]
     assert [text.split("'")[1] for text in drained.request.stays] == ["a"]

@@ -10,9 +10,9 @@ from types import MappingProxyType
 
 from demandops.base import naming
 from demandops.base.errors import Refused
+from demandops.base.naming import id_problem
 from demandops.decide.decision import Decision
 from demandops.model.config.inventory import Node
-from demandops.model.demand.demand_request import id_problem
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -43,7 +43,7 @@ def claims_after(*goals: Any) -> list[Claim]:
 def without_marks(claim: Claim) -> Claim:
     """Return a claim none of whose topics is marked as a further one of its source."""
     inputs = {
-        role: tuple(topic._replace(further=False) for topic in topics)
+        role: tuple(replace(topic, further=False) for topic in topics)
         for role, topics in claim.application.inputs.items()
     }
     return replace(claim, held=claim.application.with_inputs(inputs))
@@ -83,7 +83,7 @@ def test_a_claim_that_a_person_writes_or_restores_must_not_bring_a_topic_twice()
     places = [(path_of(app.key), "id"), (path_of(link.key), "topics[0].target")]
     assert [(one.file, one.field) for one in found] == places
     assert all("'edge/fusion-1' already publishes this topic" in one.message for one in found)
-    refusal = here.take(Restoration("rollback", claims=tuple(both.ledger)))
+    refusal = here.take(Restoration(id="rollback", claims=tuple(both.ledger)))
     assert sorted(str(refusal).splitlines()) == sorted(map(str, found))
 
 

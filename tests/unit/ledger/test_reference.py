@@ -15,10 +15,10 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
+from demandops.decide.admission.completing import with_definitions
 from demandops.decide.booking import apply
-from demandops.model.demand import deployment_request_goal
 from demandops.model.demand.demand import Demand
-from demandops.model.demand.demand_request import Join
+from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import Ledger
 
@@ -165,7 +165,7 @@ def made(random: Random) -> Goal:
     return goal(*parts, id=random.choice("rs"), shutdown=random.random() < 0.5)
 
 
-def is_answered_once(ledger: Ledger, request: DemandRequest) -> bool:
+def is_answered_once(ledger: Ledger, request: Demand) -> bool:
     """Return whether the request joins what its claims lack, or ends what they hold.
 
     The operators count a join that is repeated once more. They let a shutdown of another request
@@ -174,22 +174,20 @@ def is_answered_once(ledger: Ledger, request: DemandRequest) -> bool:
     for one in request.demanded:
         own = ledger.get(ClaimKey(one.held.subject, demand_id(request.id, one.requesters)))
         listed, held = {*one.held.topic_keys()}, {*own.held.topic_keys()} if own else set()
-        if listed & held if isinstance(request, Join) else not listed <= held:
+        if listed & held if request.operation == "join" else not listed <= held:
             return False
     return True
 
 
 def test_what_none_of_the_differences_affects_is_counted_as_by_the_operators() -> None:
-    appdef = MemoryRepo().config.appdef_by_wire_type
+    config = MemoryRepo().config
     sent, seeds = dict.fromkeys((True, False), 0), range(40 * TIMES if IN_FULL else 14)
     now = datetime(2026, 1, 31, tzinfo=timezone.utc)
     for seed in seeds:
         random, ledger, operators = Random(seed), Ledger(), Operators()
         for _ in range(200):
             asked = made(random)
-            request, faults = deployment_request_goal.parse(asked, appdef)
-            assert request is not None
-            assert not faults
+            request = with_definitions(read_goal(asked), config)
             there = deepcopy(operators)
             if there.take(asked) or not is_answered_once(ledger, request):
                 continue
@@ -202,14 +200,13 @@ def test_what_none_of_the_differences_affects_is_counted_as_by_the_operators() -
 
 def test_the_papers_table_is_the_operators_in_all_orders_of_joining_and_leaving() -> None:
     goals = [plain_yaml.load(file.read_text()) for file in EXPERIMENT]
-    appdef = MemoryRepo().config.appdef_by_wire_type
+    config = MemoryRepo().config
     now = datetime(2026, 1, 31, tzinfo=timezone.utc)
     for joining, leaving in product(permutations(goals[:4]), permutations(goals[4:])):
         ledger, operators = Ledger(), Operators()
         for each in (*joining, *leaving):
             assert not operators.take(each)
-            request, _ = deployment_request_goal.parse(each, appdef)
-            assert request is not None
+            request = with_definitions(read_goal(each), config)
             ledger, _ = apply(ledger, request, now)
             assert counted(ledger) == operators.books()
         assert not len(ledger)

@@ -37,7 +37,7 @@ def with_ledger(repo: MemoryRepo, ledger: Ledger) -> State:
 
 def back_to(claims: Iterable[Claim], *, drop_newer: bool = False) -> Restoration:
     return Restoration(
-        "", to="0" * 40, claims=tuple(claims), drop_newer=drop_newer, reason="r", by="A person"
+        to="0" * 40, claims=tuple(claims), drop_newer=drop_newer, reason="r", by="A person"
     )
 
 

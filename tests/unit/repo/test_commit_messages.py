@@ -50,7 +50,7 @@ def messages() -> Iterator[tuple[str, str]]:
     repo = waiting_repo()
     for number in range(4):
         taken = repo.take(put(f"d{number}", 4))
-    gone = Decommission("solo", kinds=frozenset({"requester"}))
+    gone = Decommission(id="solo", kinds=frozenset({"requester"}))
     for goal in (put("d4", 4, requesters=["solo"]), gone, release("d3"), None):
         assert isinstance(taken, Decision)
         yield "a demand that waits", commit_message.of_decision(taken, "op", repo.now)

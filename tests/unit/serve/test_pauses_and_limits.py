@@ -12,8 +12,7 @@ from demandops.base.runtime import REAL
 from demandops.connections.connection import Connection, Route
 from demandops.connections.mqtt import MQTT
 from demandops.model.config.load import load
-from demandops.model.demand.demand import Application, Item, Lease
-from demandops.model.demand.demand_request import Join
+from demandops.model.demand.demand import Application, Demand, Item, Lease
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
 from demandops.serve.timing.expiry import LeaseExpiry
@@ -175,7 +174,7 @@ class Sending:
     def send(self, requester: str, at_s: float, operation: str = "") -> bool:
         """Send a demand; return whether the limit allowed it."""
         app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
-        request = Join("one", (Item(app, (requester,), "applications[0].{}".format),))
+        request = Demand("join", "one", (Item(app, (requester,)),))
         moment, name = NOW + timedelta(seconds=at_s), operation or next(self._names)
         return not list(self.throttle.faults(request, self._config, name, moment))
 

@@ -66,7 +66,7 @@ def _matched_field(selector: Selector, item: Item, config: Config) -> str:
         index = next(i for i, name in enumerate(item.requesters) if matches(name, patterns))
         return f"requesters[{index}]"
     if selector.services or selector.appdefs:
-        return "appdef"
+        return "type"
     if isinstance(item.held, Application):
         return "node"
     source = item.held.source

@@ -250,5 +250,5 @@ def services_of(config: Config, name: str) -> Services:
     if services is None:
         message = f"'{name}' is in use, but appdefs/{name} is gone; restore it"
         file = f"appdefs/{name}/appdef.yaml"
-        raise Refused.at("appdef", message, code="unknown-application", file=file)
+        raise Refused.at("type", message, code="unknown-application", file=file)
     return services

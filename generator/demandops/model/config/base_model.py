@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from datetime import datetime, timezone
 from functools import lru_cache
-from typing import Annotated, Any, Literal, TypeVar, cast, get_args
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -168,13 +168,13 @@ _AS_WRITTEN: Any = {"mode": "json", "by_alias": True, "exclude_defaults": True}
 
 
 @lru_cache(maxsize=64)
-def _adapter(model: Hashable) -> TypeAdapter[Any]:
+def _adapter(model: type[Any]) -> TypeAdapter[Any]:
     return TypeAdapter(model)
 
 
 def plain(part: object) -> dict[str, Any]:
     """Return a part as plain data, without the fields that have their defaults."""
-    data: dict[str, Any] = _adapter(cast(Hashable, type(part))).dump_python(part, **_AS_WRITTEN)
+    data: dict[str, Any] = _adapter(type(part)).dump_python(part, **_AS_WRITTEN)  # type: ignore[arg-type]
     return data
 
 

@@ -13,6 +13,7 @@ from bisect import bisect_left
 from collections.abc import Container, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta, timezone
+from functools import cached_property
 from itertools import islice, takewhile
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -120,7 +121,7 @@ class Requirement:
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
@@ -187,11 +188,16 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        return [
-            topic
-            for topic in self.inputs.get(role, ())
-            if (topic.further or self.separate) and topic.part_in(self.own_version) == part
-        ]
+        return self._further_by_part.get((role, part), [])
+
+    @cached_property
+    def _further_by_part(self) -> dict[tuple[str, str], list[InputTopic]]:
+        # computed only once, because the plans of many services need it
+        by_part: dict[tuple[str, str], list[InputTopic]] = {}
+        for role, topic in self.all_inputs():
+            if topic.further or self.separate:
+                by_part.setdefault((role, topic.part_in(self.own_version)), []).append(topic)
+        return by_part
 
     def needs(self, node: str) -> bool:
         delivered = any(delivery.node == node for delivery in self.deliver)

@@ -347,16 +347,15 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
     try:
         # exactly what a restart would read from the journal, so that it decides the same
         goal = json.loads(json.dumps(goal))
-        is_deep = _is_deeper(goal, strict_yaml.MAX_DEPTH)
     except (TypeError, ValueError, RecursionError):
-        is_deep = True
-    if is_deep:
-        message = f"the goal is not plain data, or is nested more than {strict_yaml.MAX_DEPTH} "
-        message += "deep; give only text, numbers, true, false, null, lists and mappings"
-        raise Refused([fault("", message)])
+        goal = _TOO_DEEP
     # before anything is parsed, because the parser's work grows with the goal
     if large := list(length_faults(goal, limits)):
         raise Refused(large)
+    if goal is _TOO_DEEP or _is_deeper(goal, strict_yaml.MAX_DEPTH):
+        message = f"the goal is not plain data, or is nested more than {strict_yaml.MAX_DEPTH} "
+        message += "deep; give only text, numbers, true, false, null, lists and mappings"
+        raise Refused([fault("", message)])
     if not isinstance(goal, dict):
         raise Refused([fault("", _NOT_A_MAPPING)])
     faults = list(_keys_not_unicode(goal, ()))
