@@ -1,0 +1,125 @@
+"""A state repo of the second version, with faults on main, a proposal and a journal, is carried on.
+
+``tests/fixtures/second-version/README.md`` says what it holds.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from demandops.base import settings
+from demandops.repo.write.journal import read
+
+from tests.integration.conftest import On
+from tests.kit import plain_yaml
+from tests.kit.cli import Run
+from tests.kit.clock import Clock
+from tests.kit.generator import running, wait_until
+from tests.kit.repo import GitRepo, Person, branches, git, operations, root
+
+FIXTURE = Path(__file__).parents[1] / "fixtures" / "second-version"
+FACTS: dict[str, Any] = plain_yaml.load((FIXTURE / "facts.yaml").read_text())
+
+pytestmark = pytest.mark.usefixtures("git_environment")
+
+
+@pytest.fixture
+def state(tmp_path: Path) -> GitRepo:
+    path = tmp_path / "state.git"
+    git(tmp_path, "clone", "--quiet", "--bare", str(FIXTURE / "state.bundle"), str(path))
+    return GitRepo(path)
+
+
+@pytest.fixture
+def person(state: GitRepo, tmp_path: Path) -> Person:
+    return Person(state.path, tmp_path / "person")
+
+
+@pytest.fixture
+def journal(state: GitRepo, data_home: Path) -> Path:
+    """The journal of the killed generator, where the next one for the state repo finds it."""
+    path = settings.data_home(str(state.path)) / "slot-0" / "outbox.jsonl"
+    path.parent.mkdir(parents=True)
+    shutil.copy(FIXTURE / "outbox.jsonl", path)
+    return path
+
+
+@pytest.fixture
+def clock() -> Clock:
+    """A clock that begins when the generator was killed: no lease has ended yet."""
+    clock = Clock()
+    clock.set_by((datetime.fromisoformat(FACTS["made"]) - clock.now()).total_seconds())
+    return clock
+
+
+def ledger(state: GitRepo) -> list[dict[str, Any]]:
+    files = state.files("ledger/").items()
+    return [plain_yaml.load(text) for path, text in files if path.endswith(".yaml")]
+
+
+def assert_verified(on: On, since: str) -> None:
+    assert on("verify", f"{since}..").code == 0
+    assert git(on.state, "fsck", "--strict", "--no-dangling", "--no-progress") == ""
+
+
+def mend(state: GitRepo, person: Person) -> None:
+    before = state.files(revision="before-faults")
+    broken = [*FACTS["faults"], FACTS["heldBack"]]
+    person.change({path: before[path] for path in broken}, "Mend the inventory and the claim")
+
+
+def test_its_history_verifies_and_holds_what_the_facts_say(on: On, state: GitRepo) -> None:
+    assert (state.tip, branches(state.path)) == (FACTS["main"], [FACTS["proposal"]["branch"]])
+    assert_verified(on, root(state.path))
+    assert Counter(file["kind"] for file in ledger(state)) == FACTS["kinds"]
+    assert {*FACTS["ledger"]} <= state.files("ledger/").keys()
+    services = on("bookkeeping", "--output", "json").json()["services"]
+    assert services.keys() <= {*FACTS["releases"]}
+    names = {path.rpartition("/")[2].removesuffix(".yaml") for path in state.manifests()}
+    assert {*FACTS["releases"]} <= names
+
+
+def test_check_and_upgrade_name_the_faults_on_main(
+    demandops: Run, on: On, state: GitRepo, tmp_path: Path
+) -> None:
+    git(tmp_path, "clone", "--quiet", str(state.path), "clone")
+    faults = demandops("check", tmp_path / "clone", "--output", "json").json()["faults"]
+    told = on.refused("upgrade")
+    for file, fields in FACTS["faults"].items():
+        assert {fault["field"] for fault in faults if fault["file"] == file} == {*fields}
+        assert all(f"error: {file}: {field}: " in told for field in fields)
+
+
+def test_a_generator_publishes_the_journal_once_and_keeps_the_proposal_open(
+    on: On, state: GitRepo, journal: Path, clock: Clock
+) -> None:
+    proposal, pending = FACTS["proposal"], sorted(FACTS["pending"].values())
+    assert read(journal).keys() == {proposal["operation"], *pending}
+    for _ in range(2):
+        with running(state.path, runtime=clock):
+            wait_until(lambda: read(journal).keys() == {proposal["operation"]}, "all is published")
+    published = [id for id in operations(state.path) if id in pending]
+    assert sorted(published) == pending
+    (shown,) = on("get", "proposals", "--output", "json").json()["items"]
+    assert shown["branch"] == proposal["branch"]
+    held = {file["demand"] for file in ledger(state) if file["kind"].endswith("Claim")}
+    assert held & {"visit", "pending-put", "closed"} == {"pending-put"}
+    assert_verified(on, FACTS["main"])
+
+
+def test_when_people_have_mended_main_all_is_valid_and_an_upgrade_has_nothing_to_do(
+    demandops: Run, on: On, state: GitRepo, person: Person, clock: Clock, tmp_path: Path
+) -> None:
+    mend(state, person)
+    with running(state.path, runtime=clock, fetch_interval=0.05):
+        wait_until(lambda: not state.files(".demandops/reports/"), "the report is gone")
+    assert state.files("overrides/two-at-the-edge.yaml")
+    git(tmp_path, "clone", "--quiet", str(state.path), "clone")
+    assert demandops("check", tmp_path / "clone").code == 0
+    assert "nothing to do" in on("upgrade").out
+    assert_verified(on, FACTS["main"])
