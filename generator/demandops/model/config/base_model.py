@@ -184,7 +184,7 @@ def _number(value: object) -> object:
     raise PydanticKnownError("float_type")
 
 
-plain_number = BeforeValidator(_number, json_schema_input_type=float)
+plain_number = BeforeValidator(_number)
 
 
 class FrozenModel(BaseModel):
