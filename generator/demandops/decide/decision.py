@@ -286,6 +286,8 @@ def _booked(
     state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
 ) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
     checkpoint()
+    if strangers := list(permission.owner_faults(request, state.ledger, state.config)):
+        raise Refused(strangers)
     subjects = request.subjects()
     # Claims of the request replace those that overrides kept. Else a kept claim, which nobody
     # demands any longer, would contradict the request.

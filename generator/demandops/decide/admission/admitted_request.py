@@ -188,11 +188,12 @@ def admitted(
             raise
         parsed = with_separate_instances(demand_goal.parse(goal)[0], state.config)
         before = state.ledger.waiting.get(parsed.demand)
-        mine = before is None or {*before.requesters} & {*parsed.requesters()}
         # a demand that holds claims keeps them when it is refused, so it cannot wait as well
         holds = state.ledger.claims_of_demand(parsed.demand)
-        if not isinstance(parsed, Put) or holds or not mine:
+        if not isinstance(parsed, Put) or holds:
             raise
+        if strangers := list(permission.owner_faults(parsed, state.ledger, state.config)):
+            raise Refused(strangers) from None
         if not placement.may_wait(parsed, state, checkpoint):
             raise
         if faults := list(throttle(parsed, state.config)):
