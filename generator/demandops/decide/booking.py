@@ -239,18 +239,16 @@ def shut_down(ledger: Ledger, request: Shutdown) -> tuple[Ledger, Changes]:
         claim = ledger.get(ClaimKey(subject, demand_id(request.id, item.requesters)))
         if claim and not (claim.joined and claim.held.matches_listed(item.held)):
             claim = None
-        listed = [words for words, _ in item.held.listed_topics(item.held)]
         if claim is None:
-            not_held += [f"{subject}: {words} for {who}" for words in listed]
-            not_held += [] if listed else [f"{subject} for {who}"]
-        elif not listed:
-            taken.setdefault(claim.key, set()).update(claim.held.topic_keys())
-        else:
-            for words, held in claim.held.listed_topics(item.held):
-                if held:
-                    taken.setdefault(claim.key, set()).update(held)
-                else:
-                    not_held.append(f"{subject}: {words} for {who}")
+            not_held.append(f"{subject} for {who}")
+            continue
+        listed = list(claim.held.listed_topics(item.held))
+        topics = {key for _, keys in listed for key in keys}
+        if not listed:
+            topics = {*claim.held.topic_keys()}
+        if topics:
+            taken.setdefault(claim.key, set()).update(topics)
+        not_held += [f"{subject}: {words} for {who}" for words, keys in listed if not keys]
     if not taken:
         similar = [
             f"{claim.subject} for {', '.join(claim.requesters)} ("
@@ -268,8 +266,8 @@ def shut_down(ledger: Ledger, request: Shutdown) -> tuple[Ledger, Changes]:
         ]
         shown = "; ".join(dict.fromkeys(similar[:5])) or "none"
         message = (
-            f"nothing that the shutdown lists is held by the request '{request.id}' of these "
-            f"requesters; similar claims: {shown}"
+            f"nothing that the shutdown lists is held by a join with the id '{request.id}' and the "
+            f"same requesters; similar claims: {shown}"
         )
         place = request.demanded[0].fault if request.demanded else fault
         raise Refused([place("id", message, code="not-held")])
