@@ -271,6 +271,8 @@ class TestVerifyByDifferences:
             ("ledger/connections/00/x-0/y-0.yaml", "join"),
             ("overrides/a", "join"),
             (f"{SHUTDOWNS_ROOT}/x.yaml", "put"),
+            ("appdefs/object-detection-fusion/appdef.yaml", "upgrade"),
+            ("ledger/replicas/00/x.yaml", "upgrade"),
             ("claim", "join"),  # of the demand that the commit names, but with a comment
             ("claim", "follow"),  # of a demand that the commit does not name
         ],

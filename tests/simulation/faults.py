@@ -26,8 +26,8 @@ from demandops.decide.planning import overrides, planner, release_keys
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Lease
 from demandops.model.ledger import ledger
-from demandops.model.ledger.claim import Claim
-from demandops.model.ledger.records import RecentShutdowns, Wait, WaitingDemand
+from demandops.model.ledger.claim import Claim, path_of, text_of
+from demandops.model.ledger.records import Wait, WaitingDemand
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.load import snapshot
 from demandops.repo.write import journal
@@ -319,7 +319,7 @@ def bring_back_what_was_deleted(
     for claim in before.state.ledger:
         if ledger.get(claim.key) is None:
             ledger = ledger.replace(claim.key, claim)
-            files[claim_files.path_of(claim.key)] = claim_files.text_of(claim)
+            files[path_of(claim.key)] = text_of(claim)
     follow(batch, advance, before, now)
     if files:
         author = batch._objects[advance.snapshot.commit].author
