@@ -201,10 +201,11 @@ def _refused(state: State, demand: Demand, faults: Iterable[Fault]) -> Refused:
         if appdef.deployment_request
     }
     named = with_definitions(demand, config)
-    return Refused(
+    told = (
         each if each.file else replace(each, field=goal_field(each.field, named, roles))
         for each in faults
     )
+    return Refused(dict.fromkeys(told))  # a fault of the requesters is one of each item
 
 
 def _admitted_or_waiting(

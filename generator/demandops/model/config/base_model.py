@@ -19,6 +19,7 @@ from pydantic import (
     StringConstraints,
     TypeAdapter,
     ValidationError,
+    ValidationInfo,
 )
 from pydantic.alias_generators import to_camel
 from pydantic_core import PydanticKnownError
@@ -162,6 +163,20 @@ Approval = Literal["none", "required"]
 # The configuration of a part that is a dataclass: pydantic reads it from a mapping, with no other
 # fields, and :func:`plain` writes it. Code makes copies of it without any check.
 PART = ConfigDict(extra="forbid")
+
+
+# Given as context, it says that people or clients write what is read.
+GOAL = "goal"
+
+
+def _recorded(value: object, info: ValidationInfo) -> object:
+    if info.context == GOAL:
+        raise ValueError("is recorded by the generator; remove it")
+    return value
+
+
+# Marks a field that only the generator writes.
+RECORDED = BeforeValidator(_recorded)
 
 
 _AS_WRITTEN: Any = {"mode": "json", "by_alias": True, "exclude_defaults": True}

@@ -26,7 +26,7 @@ from demandops.base.naming import Subject, SubjectKind, TopicKey, absolute_topic
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_word
-from demandops.model.config.base_model import PART, Items, Moment, time_text, without
+from demandops.model.config.base_model import PART, RECORDED, Items, Moment, time_text, without
 from demandops.model.config.inventory import Position, read_condition
 
 # ---- applications ----
@@ -43,7 +43,7 @@ class InputTopic:
     type: str = ""
     # It was not the usual topic of its source when it was booked. The claim says so, because a name
     # that is made from it must not change while it is demanded (:mod:`.flows`).
-    further: SkipJsonSchema[StrictBool] = False
+    further: Annotated[StrictBool, RECORDED, SkipJsonSchema()] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "topic", absolute_topic(self.topic))
@@ -157,11 +157,11 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     # the nodes of services that have one of their own, by service
     services: Mapping[str, str] = field(default_factory=dict)
     # this version runs beside others, and the id ends in it (:mod:`.completing`)
-    separate: SkipJsonSchema[StrictBool] = False
+    separate: Annotated[StrictBool, RECORDED, SkipJsonSchema()] = False
     # the nodes to which an override moves services, by service
-    moved: SkipJsonSchema[Mapping[str, str]] = field(default_factory=dict)
+    moved: Annotated[Mapping[str, str], RECORDED, SkipJsonSchema()] = field(default_factory=dict)
     # the services whose node the demand itself names; the generator chose the nodes of the others
-    named: SkipJsonSchema[Items[str]] = ()
+    named: Annotated[Items[str], RECORDED, SkipJsonSchema()] = ()
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Application):
