@@ -85,14 +85,14 @@ def newer_images(branch: Path) -> None:
     edit(branch / "registry" / "images.yaml", *NEWER_PERCEPTION)
 
 
-def claim(folder: Path, needle: str = "kind: ApplicationClaim") -> Path:
+def claim(folder: Path, needle: str = "\napplication:\n") -> Path:
     files = sorted((folder / "ledger").rglob("*.yaml"))
     (found,) = [path for path in files if needle in path.read_text()]
     return found
 
 
 def delete_a_claim(branch: Path) -> None:
-    claim(branch, "connection: vehicle00/edge").unlink()
+    claim(branch, "connection:\n  id: vehicle00/edge\n").unlink()
 
 
 def with_requesters(branch: Path, names: list[str]) -> None:
