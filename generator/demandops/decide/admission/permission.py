@@ -26,6 +26,7 @@ from demandops.model.demand.demand_request import (
     Renew,
 )
 from demandops.model.ledger.ledger import Ledger
+from demandops.model.ledger.records import Wait
 
 # pairs of a rule's field, such as ``nodes``, and a value that this field must allow
 Access = list[tuple[str, str]]
@@ -137,8 +138,6 @@ def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
 
 def owner_faults(request: DemandRequest, ledger: Ledger, config: Config) -> Iterator[Fault]:
     """Yield a fault if the request changes a demand of others, which no rule lets it manage."""
-    if not isinstance(request, Put | Release | Renew):
-        return
     waiting, claims = ledger.waiting.get(request.demand), ledger.claims_of_demand(request.demand)
     owners = waiting.requesters if waiting else requesters_of(claims)
     homes = None if waiting else [claim.held.home for claim in claims]
@@ -150,7 +149,8 @@ def stranger_faults(
 ) -> Iterator[Fault]:
     # ``homes`` are the nodes of the demand's claims; None if it waits for one
     owners, asking = {*owners}, {*request.requesters()}
-    if not owners or asking == owners:
+    # the generator itself ends leases, and names nobody
+    if not isinstance(request, Put | Release | Renew | Wait) or not owners or asking == owners:
         return
     strangers = asking - owners
 
