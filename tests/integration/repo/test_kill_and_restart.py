@@ -25,17 +25,13 @@ LANES = 4
 
 
 def _client(lane: int) -> list[tuple[str, rig.Goal]]:
-    """Return a client's demands in order; of every three joins, two are followed by a leave.
-
-    No two joins have a requester in common. If two had one, a repeated leave of the first could end
-    the second (docs/decisions/0023-a-shutdown-takes-holds.md).
-    """
+    """Return a client's demands in order; of every three joins, two are followed by a leave."""
     made = []
     for turn in range(60):
         number = lane + turn * LANES
-        made.append((f"join-{number}", goal(number, alone=True)))
+        made.append((f"join-{number}", goal(number)))
         if turn % 3:
-            made.append((f"leave-{number}", goal(number, alone=True, shutdown=True)))
+            made.append((f"leave-{number}", goal(number, shutdown=True)))
     return made
 
 
