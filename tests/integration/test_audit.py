@@ -214,7 +214,7 @@ class TestRollback:
         assert (ran.code, played.tip) == (1, before)
 
 
-FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 2\n"
+FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 3\n"
 Changed = dict[str, str | None]
 
 

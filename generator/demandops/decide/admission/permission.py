@@ -130,8 +130,6 @@ def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
 
 def owner_faults(request: Demand, ledger: Ledger, config: Config) -> Iterator[Fault]:
     """Yield a fault if the request changes a demand of others, which no rule lets it manage."""
-    if request.operation not in ("put", "release", "renew"):
-        return
     waiting, claims = ledger.waiting.get(request.demand), ledger.claims_of_demand(request.demand)
     owners = waiting.requesters if waiting else requesters_of(claims)
     homes = None if waiting else [claim.held.home for claim in claims]
@@ -143,7 +141,10 @@ def stranger_faults(
 ) -> Iterator[Fault]:
     # ``homes`` are the nodes of the demand's claims; None if it waits for one
     owners, asking = {*owners}, {*request.requesters()}
-    if not owners or asking == owners:
+    # the generator itself ends leases, and names nobody
+    if not owners:
+        return
+    if request.operation not in ("put", "release", "renew", "wait") or asking == owners:
         return
     strangers = asking - owners
 

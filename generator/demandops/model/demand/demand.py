@@ -149,8 +149,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     version: str = ""
     connect: Annotated[str, type_word("auto", after=("none",))] = "auto"
     deliver: Items[Delivery] = ()
-    # The requirements on the node, kept to choose again; None if the demand names the node. One that
-    # requires nothing, as in each ROS message with a node, does not ask for a choice.
+    # The requirements on the node, kept to choose again; None if the demand names the node. A place
+    # that requires nothing, as in each ROS message with a node, does not ask for a choice.
     place: Annotated[
         Requirement | None, AfterValidator(lambda place: None if place == Requirement() else place)
     ] = None
