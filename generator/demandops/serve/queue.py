@@ -11,6 +11,7 @@ from datetime import datetime
 from typing import Any, Literal
 
 from demandops.base.errors import DemandOpsError, InvalidInput
+from demandops.base.naming import one_form
 from demandops.base.quoting import quoted
 from demandops.cluster.health import Target
 from demandops.decide.decision import Decision, Outcome
@@ -294,7 +295,7 @@ def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401
     for kind in ("application", "connection"):
         subjects += [(kind, item.get("id")) for item in _items(goal, f"{kind}s")]
     subjects += [("requester", name) for name in _requesters(goal)]
-    return frozenset((kind, id) for kind, id in subjects if isinstance(id, str))
+    return frozenset((kind, one_form(id)) for kind, id in subjects if isinstance(id, str))
 
 
 def _items(fields: dict[str, Any], name: str) -> Iterator[dict[str, Any]]:

@@ -19,7 +19,7 @@ from pydantic.alias_generators import to_camel
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path, suggestion
-from demandops.base.naming import PATTERN_WORDS, control_character
+from demandops.base.naming import PATTERN_WORDS, control_character, one_form
 from demandops.base.quoting import quoted
 
 # ---- durations and times for people: ``1h30m``, ``in 10m``, ``3m20s ago`` ----
@@ -116,8 +116,11 @@ Visible = without(
     )
 )
 
+# A validator that writes ids, and the patterns of ids, in one form
+OneForm = AfterValidator(one_form)
+
 # Any text that `Visible` accepts
-Text = Annotated[str, Visible]
+Text = Annotated[str, OneForm, Visible]
 
 Approval = Literal["none", "required"]
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, PlainValidator, ValidationError
 
 from demandops.base import strict_yaml
 from demandops.base.errors import MOST_FAULTS, Fault, Refused, fault, field_path
-from demandops.base.naming import absolute_topic
+from demandops.base.naming import absolute_topic, one_form
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.connections.connection import Connection, RouteOptions
@@ -42,7 +42,7 @@ def parse_valid_part(
     Raises Refused with the first faults, if there are too many to look for others.
     """
     faults: list[Fault] = []
-    pruned = _with_keys_of_text(data, (), faults)
+    pruned = _plain_part(data, (), faults)
     try:
         return model.model_validate(pruned), faults
     except ValidationError as error:
@@ -54,24 +54,30 @@ def parse_valid_part(
         return model.model_validate(pruned), faults
 
 
-def _with_keys_of_text(
+# the values in these fields are the application's own, and stay as they are
+_OWN_VALUES = frozenset({"parameters", "parameters_json"})
+
+
+def _plain_part(
     data: Any,  # noqa: ANN401 - plain data
     location: tuple[int | str, ...],
     faults: list[Fault],
 ) -> Any:  # noqa: ANN401
-    # without keys that are not Unicode text, and without what is too deep
+    # without keys that are not Unicode text, without what is too deep, and with ids in one form
     if len(location) > _DEEPEST_GOAL and isinstance(data, dict | list):
         message = f"is nested deeper than {_DEEPEST_GOAL} levels; make it flatter"
         faults.append(fault(field_path(location[:2]), message))
         return None
     if isinstance(data, list):
-        return [_with_keys_of_text(item, (*location, i), faults) for i, item in enumerate(data)]
+        return [_plain_part(item, (*location, i), faults) for i, item in enumerate(data)]
+    if isinstance(data, str) and not data.isascii() and _OWN_VALUES.isdisjoint(location):
+        return one_form(data)
     if not isinstance(data, dict):
         return data
     kept = {}
     for key, value in data.items():
         if isinstance(key, str) and is_unicode(key):
-            kept[key] = _with_keys_of_text(value, (*location, key), faults)
+            kept[key] = _plain_part(value, (*location, key), faults)
         else:
             remedy = "write whole characters" if isinstance(key, str) else "put it in quotes"
             message = f"the key {strict_yaml.short_repr(key)} must be text; {remedy}"
