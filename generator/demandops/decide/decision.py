@@ -81,7 +81,7 @@ class Decision:
         """A sentence for each placed application or service: the chosen node and the reason."""
         if isinstance(self.request, Drain):
             return self.request.moved
-        return tuple(text for item in self.request.demanded for text in item.placed)
+        return _once(*(text for item in self.request.demanded for text in item.placed))
 
     @property
     def lease_s(self) -> int | None:
@@ -169,6 +169,10 @@ def decide(
 
 def _too_large(spent: OverBudget) -> Fault:
     return fault("", str(spent), code="too-large")
+
+
+def _once(*texts: str) -> tuple[str, ...]:
+    return tuple(filter(None, dict.fromkeys(texts)))
 
 
 # The codes of faults that might not occur if other nodes were chosen for the demand
@@ -267,15 +271,16 @@ def _decided(
         changes=changes,
         files=rendered.files if changes.claims or changes.waiting else {},
         releases=rendered.releases,
-        warnings=(
+        # a demand may list one thing twice, and several releases may have one reason
+        warnings=_once(
             *notes_on(request, after, changes, rendered),
-            *filter(None, (difference.warning() for difference in differing)),
+            *(difference.warning() for difference in differing),
         ),
-        approval=(
+        approval=_once(
             *permission.approval_reasons(
                 request, ((c.before, c.after) for c in changes.claims), config
             ),
-            *filter(None, (difference.approval_reason() for difference in differing)),
+            *(difference.approval_reason() for difference in differing),
         ),
         overrides=rendered.overrides,
         frees=any(amount < 0 for amount in grown.values()),

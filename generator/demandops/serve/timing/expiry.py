@@ -2,9 +2,10 @@
 
 A person may set the clock. A clock that is set back only delays the end of a lease. A clock that
 jumps forward would end leases that were renewed in time, so after a jump every lease gets its
-full term again. The sleep of a machine looks like a jump and has the same effect. While no generator
-ran, nobody could renew a lease, so after a start no lease ends before its term, or ten minutes of a
-longer one, have passed. Overrides and kept replicas get no more time after a jump or a start.
+full term again. The sleep of a machine looks like a jump and has the same effect. While no
+generator ran, nobody could renew a lease, so after a start no lease ends before its term, or ten
+minutes of a longer one, have passed. Overrides and kept replicas get no more time after a jump or
+a start.
 """
 
 from __future__ import annotations
