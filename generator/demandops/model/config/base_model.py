@@ -116,11 +116,13 @@ Visible = without(
     )
 )
 
+# Any text that `Visible` accepts
+Text = Annotated[str, Visible]
+
 # A validator that writes ids, and the patterns of ids, in one form
 OneForm = AfterValidator(one_form)
 
-# Any text that `Visible` accepts
-Text = Annotated[str, OneForm, Visible]
+Pattern = Annotated[Text, OneForm]
 
 Approval = Literal["none", "required"]
 
