@@ -273,7 +273,7 @@ def _decided(
         releases=rendered.releases,
         # a demand may list one thing twice, and several releases may have one reason
         warnings=_once(
-            *notes_on(request, after, changes, rendered),
+            *notes_on(request, state, after, changes, rendered),
             *(difference.warning() for difference in differing),
         ),
         approval=_once(
@@ -350,7 +350,7 @@ def scale_down(
 
 
 def notes_on(
-    request: DemandRequest, after: World, changes: Changes, rendered: Changeset
+    request: DemandRequest, before: World, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
     yield from admitted_request.notes(request)
     # a connection that an override denies carries nothing
@@ -374,7 +374,7 @@ def notes_on(
                     f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
                     "the inventory), so no client of this connection carries it"
                 )
-    yield from warnings.notes(request, after)
+    yield from warnings.notes(request, before)
     yield from rendered.blocked
     if changes.repeats is not None:
         at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
