@@ -73,8 +73,9 @@ class Decision:
     approval: tuple[str, ...] = ()
     # the paths of the overrides that change the content of the rendered files
     overrides: tuple[str, ...] = ()
-    # whether services now request less of a node, so that waiting demands are tried again
-    frees: bool = False
+    # whether waiting demands are tried again: services now request less of a node, or one of the
+    # demands shares an application that was booked
+    awaited: bool = False
 
     @property
     def placed(self) -> tuple[str, ...]:
@@ -283,7 +284,21 @@ def _decided(
             *(difference.approval_reason() for difference in differing),
         ),
         overrides=rendered.overrides,
-        frees=any(amount < 0 for amount in grown.values()),
+        awaited=any(amount < 0 for amount in grown.values())
+        or _books_awaited(state, request, changes),
+    )
+
+
+def _books_awaited(before: State, request: DemandRequest, changes: Changes) -> bool:
+    # a demand that waits for room for an application runs wherever another demand books it
+    if not before.ledger.waiting:
+        return False
+    booked = {change.key.subject.id for change in changes.claims if change.after}
+    return any(
+        app.get("id") in booked
+        for waiting in before.ledger.waiting.values()
+        if waiting.demand != request.demand
+        for app in waiting.goal.get("applications") or ()
     )
 
 
