@@ -125,6 +125,18 @@ def test_who_could_not_renew_while_no_generator_ran_can_after_the_start(
     assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["gone"]]
 
 
+def test_a_generator_that_starts_holds_up_no_end_at_another(
+    clock: Clock, url: str, bare: Path
+) -> None:
+    with rig.running(url, runtime=clock) as generator:
+        rig.book(generator, put("d"))
+        clock.pass_(50)
+        with rig.running(url, runtime=clock):
+            clock.pass_(11)
+            wait_until_gone(generator, "d")
+    assert len(expiries(bare)) == 1
+
+
 def test_an_end_that_waits_while_the_clock_is_set_back_does_not_come(
     clock: Clock, url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
