@@ -16,7 +16,7 @@ from demandops.views.release_causes import override_report, warnings
 
 from tests.appdefs.test_recorder import ADDITIONS
 from tests.kit import plain_yaml
-from tests.kit.config import override, skeleton
+from tests.kit.config import edited, override, skeleton
 from tests.kit.memory import NOW, MemoryRepo
 
 ROOT = Path(__file__).parents[2]
@@ -126,7 +126,9 @@ def test_a_change_of_requesters_replans_only_what_depends_on_them(
 ) -> None:
     select = {"requesters": selected, "services": ["driver"]}
     overrides = {"overrides/tested.yaml": override(select, replicas=0)} if selected else {}
-    repo = books(scaling, **overrides)
+    managing = "    rules: [{name: all, requesters: ['*'], manages: ['*']}]\n    namespace:"
+    policy = edited("policy/access-domains.yaml", "    namespace:", managing)
+    repo = books(scaling, **overrides, **policy)
     repo.send(demand(topics=3, requesters=requesters - 1))
     for count in (requesters, requesters - 1):
         before = repo.state
