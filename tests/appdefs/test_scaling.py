@@ -16,7 +16,7 @@ from demandops.views.release_causes import override_report, warnings
 
 from tests.appdefs.test_recorder import ADDITIONS
 from tests.kit import plain_yaml
-from tests.kit.config import override, skeleton
+from tests.kit.config import edited, override, skeleton
 from tests.kit.memory import NOW, MemoryRepo
 
 ROOT = Path(__file__).parents[2]
@@ -126,17 +126,18 @@ def test_a_change_of_requesters_replans_only_what_depends_on_them(
 ) -> None:
     select = {"requesters": selected, "services": ["driver"]}
     overrides = {"overrides/tested.yaml": override(select, replicas=0)} if selected else {}
-    policy = "policy/access-domains.yaml"
-    rules = '    rules: [{name: all, manages: ["*"]}]\n'
-    repo = books(scaling, **overrides, **{policy: skeleton("flux")[policy] + rules})
+    managing = "    rules: [{name: all, requesters: ['*'], manages: ['*']}]\n    namespace:"
+    policy = edited("policy/access-domains.yaml", "    namespace:", managing)
+    repo = books(scaling, **overrides, **policy)
     repo.send(demand(topics=3, requesters=requesters - 1))
-    before = repo.state
-    decision = repo.send(demand(topics=3, requesters=requesters))
-    keys = affected_keys(before, decision.state, decision.changes.claims)
-    assert {key.service for key in keys if isinstance(key, ServiceKey)} == services
-    again = rendered_files(decision.state)
-    assert {path: repo.files[path] for path in again} == again
-    assert sum(path.startswith("clusters/") for path in decision.files) == files
+    for count in (requesters, requesters - 1):
+        before = repo.state
+        decision = repo.send(demand(topics=3, requesters=count))
+        keys = affected_keys(before, decision.state, decision.changes.claims)
+        assert {key.service for key in keys if isinstance(key, ServiceKey)} == services
+        again = rendered_files(decision.state)
+        assert {path: repo.files[path] for path in again} == again
+        assert sum(path.startswith("clusters/") for path in decision.files) == files
 
 
 def test_argo_cd_leaves_the_number_of_an_autoscaler_alone() -> None:

@@ -86,7 +86,11 @@ def _only_removes_ignored(commit: Commit, path: str) -> bool:
 
 
 def _only_rewrites(commit: Commit, path: str) -> bool:
-    # at most the schema of a claim and the start of its lease
+    # at most the schema of a record and the start of a claim's lease
+    if path.startswith(f"{records.WAITING_ROOT}/"):
+        texts = (trees.read_text(tree, path) for tree in (commit.parents[0].tree, commit.tree))
+        waits, still = (records.read_waiting(text or "", path) for text in texts)
+        return waits is not None and waits == still and _is_canonical(commit, path)
     before, after = (
         ledger_files.valid_claim_at(tree, path) for tree in (commit.parents[0].tree, commit.tree)
     )

@@ -314,6 +314,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ("moved",)
         for role, topic in self.all_inputs():
             yield ("takes", topic.source, topic.topic)
+            yield ("from", topic.source)
             yield ("node", topic.source)
             if topic.further or self.separate:
                 yield ("further", topic.part_in(self.own_version))
