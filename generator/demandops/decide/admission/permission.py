@@ -146,7 +146,7 @@ def stranger_faults(
         return
     if request.operation not in ("put", "release", "renew", "wait") or asking == owners:
         return
-    strangers = asking - owners
+    strangers = asking - owners or asking  # some of the owners alone are strangers to the others
 
     def may_manage(domain: AccessDomain) -> bool:
         return all(
@@ -162,7 +162,7 @@ def stranger_faults(
     else:
         domains = {home: config.domain_of[home] for home in homes if home in config.domain_of}
         is_managed = bool(domains) and all(map(may_manage, domains.values()))
-    if not (strangers and is_managed):
+    if not is_managed:
         message = (
             f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; name exactly these "
             "requesters, choose another demand id, or ask for a rule that 'manages' them in policy/"
