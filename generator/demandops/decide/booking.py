@@ -186,8 +186,7 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
         others = [
             claim
             for claim in start.claims_of_demand(key.demand)
-            if not (claim.joined and claim.request == request.id)
-            or {*claim.requesters}.isdisjoint(item.requesters)
+            if not claim.joined or {*claim.requesters}.isdisjoint(item.requesters)
         ]
         if others:
             message = (

@@ -51,7 +51,8 @@ def put(demand: str, lease: Any = 60, who: str = "vehicle00", **more: Any) -> ri
 
 
 def renew(demand: str, who: str = "vehicle00") -> rig.Goal:
-    return {"kind": "Demand", "operation": "renew", "demand": demand, "requesters": [who]}
+    made = {"kind": "Demand", "operation": "renew", "demand": demand}
+    return made | {"requesters": [who, "station00"]}
 
 
 def held(generator: Generator, demand: str) -> tuple[Claim, ...]:
@@ -181,6 +182,6 @@ def test_odd_goals_are_refusals_and_no_faults_of_the_generator(
     release = {"kind": "Demand", "operation": "release"}
     with rig.running(bare) as generator:
         assert {claim.demand for claim in generator.snapshot.state.ledger} == {*names}
-        rig.book(generator, *(release | {"demand": n, "requesters": [n]} for n in names))
+        rig.book(generator, *(release | {"demand": n, "requesters": [n, "station00"]} for n in names))
     assert rig.claims(bare) == []
     rig.assert_sound(bare, verify_last=3)
