@@ -160,8 +160,6 @@ def ticket_from_journal(entry: JournalEntry) -> Ticket:
 # demand whose turn it is, the queue returns the other demand first.
 #
 # - Demands that share an application, a connection or a demand id keep their order.
-# - Goals of the reference's action that share a requester keep their order. For example, of two
-#   equal shutdowns, the second has an effect only if a join came between them.
 # - A rollback or a decommission may touch any subject, so it overtakes no demand, and no demand
 #   overtakes it.
 
@@ -293,7 +291,6 @@ def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401
     subjects += [("application", head.get("id")) for head in headers if isinstance(head, dict)]
     for kind in ("application", "connection"):
         subjects += [(kind, item.get("id")) for item in _items(goal, f"{kind}s")]
-    subjects += [("requester", name) for name in _requesters(goal)]
     return frozenset((kind, id) for kind, id in subjects if isinstance(id, str))
 
 

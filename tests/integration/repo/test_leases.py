@@ -182,6 +182,8 @@ def test_odd_goals_are_refusals_and_no_faults_of_the_generator(
     release = {"kind": "Demand", "operation": "release"}
     with rig.running(bare) as generator:
         assert {claim.demand for claim in generator.snapshot.state.ledger} == {*names}
-        rig.book(generator, *(release | {"demand": n, "requesters": [n, "station00"]} for n in names))
+        rig.book(
+            generator, *(release | {"demand": n, "requesters": [n, "station00"]} for n in names)
+        )
     assert rig.claims(bare) == []
     rig.assert_sound(bare, verify_last=3)
