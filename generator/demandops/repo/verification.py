@@ -35,7 +35,7 @@ from demandops.repo.load.snapshot import changed_kept_replicas
 
 # The folders of the ledger that have records, such as markers, instead of claims.
 _RECORDS = tuple(f"{root}/" for root in (records.MARKERS_ROOT, records.REPLICAS_ROOT))
-# No decision depends on what is below these.
+# An upgrade removes what earlier versions wrote below these.
 _GONE = tuple(f"{root}/" for root in records.GONE_ROOTS)
 # Operations that may rewrite a claim, to start its lease or to change its schema.
 _REWRITING = ("follow", "upgrade")
@@ -57,7 +57,7 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
         root = path.split("/", 1)[0]
         if root in (*GENERATED_ROOTS, NOTES_ROOT) or (path == ROOT_FILE and operation == "upgrade"):
             continue
-        if path.startswith(_GONE):
+        if operation == "upgrade" and not blob and path.startswith(_GONE):
             continue
         if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
             continue
