@@ -40,6 +40,10 @@ def books(scaling: str, *, gitops: Literal["flux", "argocd"] = "flux", **files: 
     text = text.replace("parameters:\n", "parameters:\n  size: {default: small, merge: union}\n")
     assert scaling in text
     root = {"demandops.yaml": skeleton(gitops)["demandops.yaml"]}
+    domains = "policy/access-domains.yaml"  # a put may name other requesters than the one before
+    root[domains] = skeleton()[domains].replace(
+        '    nodes: ["*"]\n', '    nodes: ["*"]\n    rules: [{name: all, manages: ["*"]}]\n'
+    )
     return MemoryRepo({**ADDITIONS, **root, APPDEF: text, **files})
 
 

@@ -270,6 +270,7 @@ class TestVerifyByDifferences:
             ("ledger/connections/00/x-0/y-0.yaml", "join"),
             ("overrides/a", "join"),
             ("ledger/overrides/x.yaml", "put"),
+            ("ledger/shutdowns/x.yaml", "put"),
             ("appdefs/object-detection-fusion/appdef.yaml", "upgrade"),
             ("claim", "join"),  # of the demand that the commit names, but with a comment
             ("claim", "follow"),  # of a demand that the commit does not name

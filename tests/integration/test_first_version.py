@@ -97,8 +97,9 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
 def test_demands_of_before_are_given_up_and_restored_after_the_upgrade(
     on: On, state: GitRepo
 ) -> None:
-    before = state.tip
+    before = state.commit({"ledger/shutdowns/0f/0f.yaml": "of a version between\n"})
     assert on("upgrade").code == 0
+    assert not state.files("ledger/shutdowns/")
     assert on("request", EXPERIMENT / "6-vehicle01-leaves.yaml").code == 0
     assert not any("vehicle01" in file.get("requesters", ()) for file in claims(state))
     assert on("rollback", before, "--reason", "try", "--drop-newer").code == 0

@@ -38,7 +38,7 @@ from demandops.repo.load import ledger_files, state_in_effect
 # A commit of the generator may change generated files, reports, and the claims that its message
 # names. Some operations may change further files.
 
-# No decision depends on what is below these.
+# An upgrade removes what earlier versions wrote below these.
 _GONE = tuple(f"{root}/" for root in records.GONE_ROOTS)
 # Operations that may rewrite a claim, to start its lease or to change its schema.
 _REWRITING = ("follow", "upgrade")
@@ -60,8 +60,9 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
         root = path.split("/", 1)[0]
         if root in (*GENERATED_ROOTS, NOTES_ROOT):
             continue
-        # of a folder, the files count
-        if path.startswith(_GONE) or isinstance(trees.entry(commit.tree, path), Tree):
+        if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
+            continue
+        if operation == "upgrade" and not blob and path.startswith(_GONE):
             continue
         if operation == "upgrade" and (path == ROOT_FILE or _only_removes_ignored(commit, path)):
             continue
