@@ -58,9 +58,10 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     named = {f"{claim_files.segment(demand)}.yaml" for demand in demands}
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
-        if root in (*GENERATED_ROOTS, NOTES_ROOT):
-            continue
-        if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
+        # of a folder, the files count
+        if root in (*GENERATED_ROOTS, NOTES_ROOT) or isinstance(
+            trees.entry(commit.tree, path), Tree
+        ):
             continue
         if operation == "upgrade" and not blob and path.startswith(_GONE):
             continue

@@ -491,7 +491,7 @@ class Demand:
         """Return what keeps demands that share it in their order; None touches everything."""
         if self.operation in ("decommission", "rollback"):
             return None
-        return frozenset((*self.subjects(), ("demand", self.demand)))
+        return frozenset((*self.subjects(), *([("demand", self.demand)] if self.demand else ())))
 
 
 AnyDemand = TypeVar("AnyDemand", bound=Demand)
