@@ -22,7 +22,7 @@ from demandops.cluster.rollouts import RolloutWatcher
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.serve.http_server import PushWebhook
-from demandops.serve.timing.pauses_and_limits import DEFAULT_INTERVAL, parse_interval
+from demandops.serve.agenda import DEFAULT_INTERVAL, parse_interval
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from rclpy.logging import get_logger

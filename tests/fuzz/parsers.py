@@ -35,8 +35,8 @@ from demandops.repo.forge import ForgeError, Gitea, GitHub
 from demandops.repo.git import local_repository as addresses
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.write import journal
+from demandops.serve.demands import ticket_from_journal
 from demandops.serve.http_server import PushWebhook
-from demandops.serve.queue import ticket_from_journal
 from demandops_interfaces.action import Demand
 from demandops_ros import messages
 from hypothesis import strategies as st

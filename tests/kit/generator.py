@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from demandops.base.errors import InvalidInput
+from demandops.serve.demands import Receipt, Ticket
 from demandops.serve.generator import Generator
-from demandops.serve.queue import Receipt, Ticket
 
 from tests.kit.goals import Goal
 from tests.kit.limits import PATIENCE_S

@@ -33,15 +33,11 @@ from demandops.repo.load import snapshot
 from demandops.repo.write import journal
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.proposal_branch import ProposalBranches
-from demandops.serve import demand_lifecycle, generator
+from demandops.serve import agenda, demands, generator
+from demandops.serve.agenda import Draining, LeaseExpiry, WaitingTurns
 from demandops.serve.approvals.approvals import Approvals
-from demandops.serve.demand_lifecycle import Demands
-from demandops.serve.evaluation import Evaluator
-from demandops.serve.queue import Receipt, Ticket
-from demandops.serve.timing import agenda, expiry
-from demandops.serve.timing.agenda import Draining, WaitingTurns
-from demandops.serve.timing.expiry import LeaseExpiry
-from demandops.serve.worker import Worker
+from demandops.serve.demands import Demands, Receipt, Ticket
+from demandops.serve.worker import Evaluator, Worker
 
 Wrong = Callable[..., Any]
 """A wrong function or property; its first argument is the right one, whose arguments follow."""
@@ -255,7 +251,7 @@ plant("run_what_is_denied", 26, release_keys, "without_suspended", itself)
 plant("book_what_is_denied", 27, quotas, "denial_faults", lambda *_: ())
 
 
-@wrong(6, expiry, "expired_overrides")
+@wrong(6, agenda, "expired_overrides")
 @wrong(10, relocation, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
@@ -392,5 +388,5 @@ def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> tup
 
 
 FAULTS["skip_approval_after_a_restart"].parts.append(
-    (demand_lifecycle, "ticket_from_journal", _forget_proposal)
+    (demands, "ticket_from_journal", _forget_proposal)
 )

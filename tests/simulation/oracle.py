@@ -19,7 +19,7 @@ from demandops.repo import verification
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import MAIN
 from demandops.repo.history.commit_log import PROPOSAL, entry_of
-from demandops.serve.queue import Ticket
+from demandops.serve.demands import Ticket
 
 from tests.kit import plain_yaml
 from tests.kit.promises import claims_of, name_of

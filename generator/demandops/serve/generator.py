@@ -21,10 +21,9 @@ from demandops.repo.history import revisions
 from demandops.repo.load import state_in_effect
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.write.journal import Slot
+from demandops.serve.agenda import Heartbeat
 from demandops.serve.approvals.approvals import Approvals
-from demandops.serve.demand_lifecycle import Demands
-from demandops.serve.queue import Listener, Ticket
-from demandops.serve.timing.pauses_and_limits import Heartbeat
+from demandops.serve.demands import Demands, Listener, Ticket
 from demandops.serve.worker import RemoteStatus, Worker
 
 log = logging.getLogger("demandops")

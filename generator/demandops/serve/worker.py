@@ -1,4 +1,4 @@
-"""The worker: follows the state repo, and publishes the demands as commits."""
+"""The worker: follows the state repo, decides the demands, and publishes them as commits."""
 
 from __future__ import annotations
 
@@ -6,12 +6,24 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
+from math import inf
 
 from demandops.base import errors
-from demandops.base.errors import DemandOpsError, StateRepoError, Unsound
+from demandops.base.errors import (
+    DemandOpsError,
+    InvalidInput,
+    Refused,
+    StateRepoError,
+    Unsound,
+    Withdrawn,
+    fault,
+    internal,
+)
 from demandops.base.runtime import Runtime
-from demandops.decide.decision import Decision
+from demandops.decide.decision import Decision, Outcome, decide
+from demandops.decide.rollback import Restoration
 from demandops.model.config.config import Config
+from demandops.model.demand.demand import Demand, Rollback
 from demandops.repo.git import signing
 from demandops.repo.git.repository import (
     FetchInterrupted,
@@ -19,18 +31,140 @@ from demandops.repo.git.repository import (
     StateRepository,
     Unavailable,
     access_error,
+    disk_error,
 )
+from demandops.repo.git.signing import SigningFailed
+from demandops.repo.history.commit_log import operations_since
+from demandops.repo.load.ledger_files import restoration
 from demandops.repo.load.snapshot import ReadAhead, Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
+from demandops.serve.agenda import (
+    LIMIT_LOCAL,
+    LIMIT_REMOTE,
+    LONGEST_EVALUATION_S,
+    LONGEST_WAIT_S,
+    Agenda,
+    Backoff,
+    Heartbeat,
+    LeaseExpiry,
+    PollTimer,
+    RateLimit,
+    Rest,
+    may_take_long,
+    within,
+)
 from demandops.serve.approvals.approvals import Approvals, Result
-from demandops.serve.demand_lifecycle import Demands
-from demandops.serve.evaluation import Evaluator
-from demandops.serve.queue import Ticket
-from demandops.serve.timing import pauses_and_limits
-from demandops.serve.timing.agenda import Agenda
-from demandops.serve.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
-from demandops.serve.timing.pauses_and_limits import LONGEST_EVALUATION_S, Backoff, PollTimer
+from demandops.serve.demands import TAKEN_BACK, Demands, Receipt, Ticket
 from demandops.templating.evaluator import DEMAND_S, processor_time
+
+# ---- one demand; if it fails, the others of the batch continue ----
+
+log = logging.getLogger("demandops")
+
+
+class Evaluator:
+    def __init__(self, repository: StateRepository, demands: Demands, approvals: Approvals) -> None:
+        self._repository, self._demands, self._approvals = repository, demands, approvals
+        self._rate_limit = RateLimit()
+
+    def evaluate(self, commits: CommitBatch, ticket: Ticket) -> Receipt | DemandOpsError | Decision:
+        # A demand that needs approval gets no commit; its result is the decision. A receipt is true
+        # only once the batch is published. Errors that concern all demands are raised.
+        if ticket.state == "withdrawn":
+            return Withdrawn(TAKEN_BACK)
+        try:
+            demand: Demand = ticket.demand
+            if isinstance(demand, Rollback):
+                demand = self._restoration(demand, commits.start)
+            state = commits.head.state
+            # of all services, once for each configuration; that is not this demand's work
+            state.usage()
+            state.names()
+            # what was booked must be released or restored, however long all of it takes
+            with processor_time(each=DEMAND_S, together=DEMAND_S if demand.adds_claims else inf):
+                decision = decide(
+                    state,
+                    demand,
+                    ticket.received,
+                    commits.read,
+                    lambda stage: ticket.notify(stage, stage),
+                    lambda request, config: self._rate_limit.faults(
+                        request, config, ticket.operation, ticket.received
+                    ),
+                    within(state.config.repo_settings.limits, self._repository.runtime),
+                )
+            if decision.approval:
+                return decision
+            # from here on the demand can no longer be taken back
+            if not self._demands.commit(ticket):
+                return Withdrawn(TAKEN_BACK)
+            self._approvals.withdraw_replaced(decision.request)
+            if decision.outcome == "waiting":
+                ticket.notify("waiting", f"waiting for room: {'; '.join(decision.warnings)}")
+            if decision.files:
+                now = self._repository.runtime.now()
+                commit = commits.commit(decision, ticket.operation, ticket.received, now)
+                ticket.notify("committed", f"committed {commit}")
+            else:
+                waits = decision.outcome == "waiting"  # the demand waited already
+                commits.record_in_next_commit(ticket.operation, "waiting" if waits else "unchanged")
+                commit = str(commits.head.commit)
+            return self._approvals.receipt(ticket, decision, commit, state)
+        except InvalidInput as error:
+            if ticket.has_released:  # the demand released a proposal, which had no claims yet
+                commits.record_in_next_commit(ticket.operation, "released")
+                commit = str(commits.head.commit)
+                return Receipt(ticket.operation, ticket.demand.id, "released", commit)
+            commits.record_in_next_commit(ticket.operation, "refused")
+            return error
+        except SigningFailed as error:
+            return error
+        except Exception as error:  # a bug that one demand triggers must not stop the others
+            reason = disk_error(error, self._repository.address)
+            if reason is not None:  # the state repo fails, so no demand can be evaluated
+                raise reason from None
+            log.exception("internal error while evaluating demand %s", ticket.operation)
+            return internal(error)
+
+    def _restoration(self, rollback: Rollback, head: Snapshot) -> Restoration:
+        to = rollback.to
+        if not self._repository.includes(str(head.commit), to):
+            message = f"commit {to} is not in the history of the state repo; roll back to one that "
+            raise Refused([fault("", f"{message}is")])
+        return restoration(self._repository.objects, rollback)
+
+    def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
+        # Oldest first, the results of those demands that main records already. They have no answer
+        # because the process or the connection ended after the push, or because an fsync failed.
+        sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
+        bases = dict.fromkeys(ticket.base for ticket in sought.values())
+        objects = self._repository.objects
+        histories = [(base, operations_since(objects, tip, base)) for base in bases]
+        # all bases are ancestors of the tip, so the most outcomes are those since the oldest base
+        since, recorded = max(histories, key=lambda history: len(history[1]), default=("", {}))
+        if published := [operation for operation in reversed(recorded) if operation in sought]:
+            # after a failed fsync only files that are written anew are sure to be on the disk
+            self._repository.write_anew(since)
+        for operation in sought.keys() - published:
+            sought[operation].base = tip  # the next search begins here
+        results = list[Result]()
+        for ticket in (sought[operation] for operation in published):
+            record = recorded[ticket.operation]
+            if record.outcome == "refused":
+                message = "the demand was refused, but the reason was lost; send the demand again"
+                results.append((ticket, Refused([fault("", message, code="refused")])))
+                continue
+            outcome: Outcome = "booked"
+            if record.outcome != "changed":
+                outcome = record.outcome
+            elif ticket.demand.operation == "rollback":
+                outcome = "restored"
+            elif ticket.demand.is_release or ticket.demand.operation == "decommission":
+                outcome = "released"
+            receipt = Receipt(ticket.operation, ticket.demand.id, outcome, record.commit)
+            results.append((ticket, receipt))
+        return results
+
 
 # ---- whether the remote can be reached, for logs and diagnostics ----
 
@@ -104,7 +238,7 @@ class Worker:
         demands: Demands,
         approvals: Approvals,
         fetch_interval: float,
-        heartbeat: pauses_and_limits.Heartbeat,
+        heartbeat: Heartbeat,
     ) -> None:
         self.snapshot = snapshot
         self.listeners: list[Callable[[Config], None]] = []
@@ -117,17 +251,13 @@ class Worker:
         self._lease_expiry = LeaseExpiry(repository.runtime)
         self._agenda = Agenda(repository.runtime)
         self._ahead = ReadAhead()
-        self._batch_limit = (
-            pauses_and_limits.LIMIT_LOCAL
-            if repository.always_current
-            else pauses_and_limits.LIMIT_REMOTE
-        )
+        self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
         self._logged: list[errors.Fault] = []
         self._warned_of_signers = False
         self._ends_soon = self._runtime.event()
-        self._rest = pauses_and_limits.Rest(repository.runtime)
+        self._rest = Rest(repository.runtime)
         self._warn_if_unsigned()
 
     # ---- from any thread ----
@@ -283,7 +413,7 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
-            if number and (is_late or pauses_and_limits.may_take_long(ticket.demand)):
+            if number and (is_late or may_take_long(ticket.demand)):
                 part, left = part[:number], part[number:] + left
                 break
             self._approvals.withdraw_released(results, ticket, commits.head.state)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 from demandops.base.errors import OverLimit
-from demandops.serve import evaluation
+from demandops.model.demand import goals
+from demandops.serve import worker
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -80,7 +81,7 @@ def test_what_shares_a_service_may_leave_and_is_renewed(bare: Path, person: Pers
 def test_a_rollback_may_take_longer_than_a_demand(
     bare: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(evaluation, "DEMAND_S", 0.05)  # hundreds of services take half a second
+    monkeypatch.setattr(worker, "DEMAND_S", 0.05)  # hundreds of services take half a second
     with rig.running(bare) as generator:
         demands = []
         for number in range(60):
@@ -90,6 +91,6 @@ def test_a_rollback_may_take_longer_than_a_demand(
         then = rig.tip(bare)
         rig.book(generator, *(demand | {"shutdown": True} for demand in demands))
         who = ("A person", "person@example.org")
-        back = evaluation.goal(then, drop_newer=False, reason="a test", who=who)
+        back = goals.rollback(then, drop_newer=False, reason="a test", who=who)
         assert receipt(generator.submit(back)).outcome == "restored"
     assert len(rig.claims(bare)) == 60

@@ -10,8 +10,8 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from demandops.model.demand import goals
 from demandops.repo.write.journal import DamagedJournal
-from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -166,7 +166,7 @@ def test_a_rollback_that_a_crash_left_in_the_journal_is_carried_out_at_the_next_
         rig.book(generator, goal(1))
         to, then = rig.tip(bare), rig.books(bare)
         rig.book(generator, goal(2))
-    back = evaluation.goal(to, drop_newer=True, reason="a test", who=("A", "a@example.org"))
+    back = goals.rollback(to, drop_newer=True, reason="a test", who=("A", "a@example.org"))
     drivers.start(bare, [[demand("back", back)]], die_at="journaled").listen()
     assert rig.books(bare) != then
     assert rig.restart(bare)

@@ -17,8 +17,8 @@ import pytest
 from demandops.base import settings
 from demandops.model.ledger.claim import Claim
 from demandops.repo.write.journal import JournalEntry, Slot
+from demandops.serve.agenda import LIMIT_LOCAL
 from demandops.serve.generator import Generator
-from demandops.serve.timing.pauses_and_limits import LIMIT_LOCAL
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock

@@ -17,8 +17,8 @@ from demandops.base.errors import (
 )
 from demandops.base.runtime import Runtime
 from demandops.repo.write.journal import JournalEntry
+from demandops.serve.demands import Ticket
 from demandops.serve.generator import Generator
-from demandops.serve.queue import Ticket
 
 from tests.kit import rig
 from tests.kit.clock import Clock

@@ -7,8 +7,8 @@ from typing import Any
 
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.journal import JournalEntry, Slot
+from demandops.serve.agenda import WaitingTurns
 from demandops.serve.generator import Generator
-from demandops.serve.timing.agenda import WaitingTurns
 from demandops.templating.evaluator import processor_time
 
 from tests.integration.repo.test_hanging_template import ENDLESS, TEMPLATE

@@ -15,12 +15,12 @@ from demandops.model.config.load import load
 from demandops.model.demand.demand import Application, Demand, Item, Lease
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
-from demandops.serve.timing.expiry import LeaseExpiry
-from demandops.serve.timing.pauses_and_limits import (
+from demandops.serve.agenda import (
     FIRST_PAUSE_S,
     LONGEST_AWAY_S,
     LONGEST_TURN_S,
     Backoff,
+    LeaseExpiry,
     PollTimer,
     RateLimit,
     parse_interval,

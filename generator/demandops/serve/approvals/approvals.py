@@ -39,7 +39,8 @@ from demandops.repo.write.proposal_branch import (
     ProposalBranches,
     branch_name,
 )
-from demandops.serve.approvals.forge_worker import CheckTimer, ForgeWorker
+from demandops.serve.agenda import CheckTimer
+from demandops.serve.approvals.forge_worker import ForgeWorker
 from demandops.serve.approvals.proposal import (
     Proposal,
     Verdict,
@@ -52,8 +53,7 @@ from demandops.serve.approvals.proposal import (
     releases,
     waiting_text,
 )
-from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
-from demandops.serve.queue import Receipt, Ticket, receipt_of
+from demandops.serve.demands import TAKEN_BACK, Demands, Receipt, Ticket, receipt_of
 
 log = logging.getLogger("demandops")
 

@@ -24,7 +24,7 @@ from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.forge import PullRequest
 from demandops.repo.history import commit_log
 from demandops.repo.write.journal import ProposalRecord
-from demandops.serve.queue import Ticket
+from demandops.serve.demands import Ticket
 
 Decided: TypeAlias = list[tuple[Ticket, Decision]]
 Failed: TypeAlias = list[tuple[Ticket, DemandOpsError]]

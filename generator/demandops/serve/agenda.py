@@ -1,0 +1,566 @@
+"""What the worker does when nobody demands anything, and when; and its pauses and limits."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
+from contextlib import suppress
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+from demandops.base.errors import Fault, InvalidInput, OverBudget, OverLimit, fault
+from demandops.base.quoting import quoted
+from demandops.base.runtime import Runtime
+from demandops.decide.booking import Drain
+from demandops.decide.decision import Checkpoint, decide
+from demandops.decide.placement.relocation import expired_overrides
+from demandops.decide.state import State
+from demandops.model.config.base_model import seconds_of
+from demandops.model.config.config import Config
+from demandops.model.config.repo_settings import ROOT_FILE, Limits
+from demandops.model.demand.demand import Demand
+from demandops.model.demand.goals import length_faults
+from demandops.model.ledger.claim import Claim
+from demandops.model.ledger.ledger import Ledger, World
+from demandops.model.ledger.records import in_turn
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.serve.demands import Receipt, Ticket
+
+# ---- the next attempt to publish: when, and with how many demands ----
+#
+# There are two kinds of delays: after another writer published first, and while the remote cannot
+# be reached. Both kinds are jittered and bounded, so no writer starves, and the writers do not
+# flood a remote that comes back.
+
+FIRST_PAUSE_S = 0.05
+LONGEST_AWAY_S = 10.0  # while the remote cannot be reached
+# After another writer published first; a writer that waits longer loses again to the others.
+LONGEST_TURN_S = 0.4
+# The most demands to publish together. A push takes about 50 ms, but moving a branch of a
+# repository on this disk takes less than 1 ms.
+LIMIT_LOCAL = 20
+LIMIT_REMOTE = 200
+
+# After this time, what was evaluated of a batch is published, and the other demands go back to the
+# queue. There, requesters take turns, so a demand that arrived meanwhile may come first. So it
+# waits for this time and for one decision, which has a limit too (limits.decisionMilliseconds).
+LONGEST_EVALUATION_S = 0.25
+
+
+class Backoff:
+    def __init__(self, limit: int, runtime: Runtime) -> None:
+        self._limit, self._runtime = limit, runtime
+        self.published()
+
+    def published(self) -> None:
+        self.max_demands = self._limit
+        self._turn = self._away = FIRST_PAUSE_S
+
+    def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
+        # The seconds to wait, as another writer published first. ``size`` counts the demands of the
+        # attempt, which took ``evaluating_s`` to commit them, and ``pushing_s`` from then on.
+
+        # a writer that evaluates for longer than its push takes always loses to faster writers
+        self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
+        wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
+        self._away = FIRST_PAUSE_S
+        return self._jittered(wait)
+
+    def unreachable(self) -> float:
+        wait, self._away = self._away, min(self._away * 2, LONGEST_AWAY_S)
+        return self._jittered(wait)
+
+    def _jittered(self, seconds: float) -> float:
+        return seconds * self._runtime.uniform(0.5, 1.0)
+
+
+# ---- a pause after an error: the worker does not fetch, but still publishes demands ----
+
+FIRST_S, LONGEST_S = 1.0, 60.0
+
+
+class Rest:
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._next, self._until = FIRST_S, runtime.monotonic()
+
+    def __bool__(self) -> bool:
+        return self._runtime.monotonic() < self._until
+
+    @property
+    def follows_success(self) -> bool:
+        return self._next == FIRST_S
+
+    def seconds_left(self) -> float:
+        return self._until - self._runtime.monotonic()
+
+    def begin(self) -> None:
+        self._until = self._runtime.monotonic() + self._next
+        self._next = min(2 * self._next, LONGEST_S)
+
+    def succeeded(self) -> None:
+        self._next = FIRST_S
+
+
+# ---- when to fetch from the state repo while no demand comes ----
+
+DEFAULT_INTERVAL = "30s"
+_SHORTEST_GAP_S = 0.5  # a Git server may report many pushes at once; they share a fetch
+# The longest interval for a repository on this disk, where a check is cheap: it reads one file.
+_LOCAL_S = 1.0
+
+
+def parse_interval(text: str) -> float:
+    """Return the seconds of a duration like ``30s`` or of a number, or raise ValueError."""
+    if re.fullmatch(r"[0-9]{1,8}(\.[0-9]{1,6})?", text):
+        return float(text)
+    return float(seconds_of(text))
+
+
+class PollTimer:
+    # any thread may call `request`, but only one thread may call the other methods
+    def __init__(self, interval: float, runtime: Runtime, *, local: bool = False) -> None:
+        # the interval grows while fetches fail; if it is 0, only `request` makes a fetch due
+        self._interval = min(interval, _LOCAL_S) if local else interval
+        self._runtime = runtime
+        self._pause = self._interval
+        self._last = runtime.monotonic() - _SHORTEST_GAP_S
+        self._next = runtime.monotonic() if interval else None
+        self._requested = runtime.event()
+
+    def request(self) -> None:
+        self._requested.set()
+
+    def seconds_until_due(self) -> float | None:
+        times = [] if self._next is None else [self._next]
+        if self._requested.is_set():
+            times.append(self._last + _SHORTEST_GAP_S)
+        return max(min(times) - self._runtime.monotonic(), 0.0) if times else None
+
+    def start_if_due(self) -> bool:
+        due = self.seconds_until_due() == 0.0
+        if due:  # clear before the fetch: a later push needs another one
+            self._requested.clear()
+        return due
+
+    def finished(self, *, reached: bool) -> None:
+        """Plan the next fetch after a fetch or a push, which both tell of others' commits."""
+        longest = max(60.0, self._interval)
+        self._last = self._runtime.monotonic()
+        if self._next is not None:
+            self._pause = self._interval if reached else min(self._pause * 2, longest)
+            # a little less at random, so that generators do not fetch all at once
+            self._next = self._last + self._pause * self._runtime.uniform(0.8, 1.0)
+
+
+# ---- the sign of life, for a supervisor such as a pod's liveness probe ----
+
+
+class Heartbeat:
+    # The worker calls it in each turn and at each wait for git. So the file grows old only if the
+    # worker is stuck, and not because a remote is away.
+    def __init__(self, file: Path | None) -> None:
+        self._file = file
+        # an earlier process may have left one; until the first turn there is none, because a start
+        # may have to clone for long
+        if file is not None:
+            with suppress(OSError):
+                file.unlink()
+
+    def __call__(self) -> None:
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.touch()
+
+
+# ---- the budget of one decision, because other demands wait meanwhile ----
+
+# The usual demand lists a dozen topics; one of this size is decided in some 10 ms.
+_USUAL = Limits.model_validate({"demandItems": 200, "demandCharacters": 20_000})
+
+
+def may_take_long(demand: Demand) -> bool:
+    # what was decided before such a demand is published first
+    return any(True for _ in length_faults(demand.goal, _USUAL))
+
+
+def within(limits: Limits, runtime: Runtime) -> Checkpoint:
+    # Only a refusal may depend on it, because another machine takes another time. Processor time,
+    # because other programs on this machine must not get a demand refused.
+    most = limits.decision_milliseconds
+    end = runtime.processor_s() + most / 1000
+
+    def checkpoint() -> None:
+        if runtime.processor_s() > end:
+            raise OverBudget(
+                f"takes more than {most} ms of processor time to decide, while other demands wait; "
+                "split the demand, or name nodes instead of 'place'; a platform engineer may raise "
+                f"limits.decisionMilliseconds in {ROOT_FILE}"
+            )
+
+    return checkpoint
+
+
+# ---- the rate of a requester, by the quotas of the access domains ----
+#
+# A generator counts only the demands that it receives itself. It counts a demand once, even if it
+# evaluates the demand several times.
+
+_WINDOW = timedelta(minutes=1)
+
+
+class RateLimit:
+    def __init__(self) -> None:
+        self._seen: dict[tuple[str, str], deque[tuple[datetime, str]]] = {}
+
+    def faults(
+        self, request: Demand, config: Config, operation: str, received: datetime
+    ) -> Iterator[Fault]:
+        # A demand counts even if it is refused afterwards. A request that adds no claims is not
+        # limited.
+        if not request.adds_claims:
+            return
+        homes = (config.domain_of.get(demanded.held.home) for demanded in request.demanded)
+        domains = {domain.name: domain for domain in homes if domain is not None}
+        for domain in domains.values():
+            most = domain.quotas.demands_per_minute
+            for requester in request.requesters() if most else ():
+                if self._count((domain.name, requester), operation, received) > (most or 0):
+                    message = (
+                        f"'{requester}' sent more than {most} demands in a minute, the limit in "
+                        f"quotas.demandsPerMinute of access domain '{domain.name}'; send the "
+                        "demand again later"
+                    )
+                    yield fault("", message, code="quota")
+
+    def _count(self, key: tuple[str, str], operation: str, received: datetime) -> int:
+        # forget requesters that sent nothing for a minute, because vehicles come and go
+        while self._seen:
+            idlest = next(iter(self._seen))
+            if (times := self._seen[idlest]) and abs(received - times[-1][0]) <= _WINDOW:
+                break
+            del self._seen[idlest]
+        seen = self._seen.pop(key, None) or deque()
+        self._seen[key] = seen  # at the end, so that the requester that is idle longest is first
+        while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
+            seen.popleft()
+        # a demand that is evaluated again keeps its number
+        operations = [earlier for _, earlier in seen]
+        if operation in operations:
+            return operations.index(operation) + 1
+        seen.append((received, operation))
+        return len(seen)
+
+
+# ---- when to check the proposals: soon after main has moved, else at an interval ----
+
+# The seconds between two checks of the branches, as only a check detects a deleted branch.
+CHECK_LOCAL_S = 1.0
+CHECK_REMOTE_S = 5.0
+# How many times as long as the last check to pause before the check of a new main, so that checks
+# take at most a tenth of the worker's time while main moves.
+_PAUSE_FACTOR = 9
+
+
+class CheckTimer:
+    def __init__(self, runtime: Runtime, *, local: bool) -> None:
+        self._runtime = runtime
+        self._interval = CHECK_LOCAL_S if local else CHECK_REMOTE_S
+        self._checked_at: str | None = ""
+        self._began = self._rest_until = self._next = 0.0
+
+    def is_due(self, tip: str, *, has_news: bool) -> bool:
+        # after a failed check, news wait for the interval: the remote is likely away
+        if has_news and self._checked_at is not None:
+            return True
+        return self.seconds_until_due(tip) <= 0
+
+    def seconds_until_due(self, tip: str) -> float:
+        has_moved = self._checked_at not in (tip, None)
+        due = min(self._next, self._rest_until) if has_moved else self._next
+        return due - self._runtime.monotonic()
+
+    def began(self) -> None:
+        self._began = self._runtime.monotonic()
+        # this plans the next check, in case this one fails
+        self._next, self._checked_at = self._began + self._interval, None
+
+    def ended(self, tip: str) -> None:
+        now = self._runtime.monotonic()
+        self._checked_at = tip
+        self._rest_until = now + _PAUSE_FACTOR * (now - self._began)
+
+
+log = logging.getLogger("demandops")
+
+# By how much the clock may gain on the monotonic clock before leases get their full term again.
+_JUMP = timedelta(seconds=30)
+# The ledger keeps a lease that has ended if its release failed, or if it got more time after a jump
+# of the clock. Without this minimum, the worker would then never wait.
+_SHORTEST_S = 1.0
+# The longest time between two checks of the leases; short, because a person may set the clock.
+LONGEST_WAIT_S = 60.0
+# The pause after a failed try to end a lease or an override.
+RETRY = timedelta(seconds=LONGEST_WAIT_S)
+
+
+class LeaseExpiry:
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._last = (runtime.now(), runtime.monotonic())
+        self._jumped_at: datetime | None = None
+        self._tried: dict[str, datetime] = {}
+        self._first: object = None
+        self._next_end: datetime | None = None
+
+    def tickets(self, ledger: Ledger) -> list[Ticket]:
+        # The tickets are correct only now: later, a requester may renew a lease, or a person may
+        # set the clock. If one does not release its claims, the next comes at least a minute later.
+        now, claims = self.ended_claims(ledger)
+        ended = dict.fromkeys(claim.demand for claim in claims)
+        # forget demands that were released or renewed meanwhile
+        self._tried = {d: at for d, at in self._tried.items() if at > now - RETRY and d in ended}
+        return [self._ticket(demand, now) for demand in ended if demand not in self._tried]
+
+    def _ticket(self, demand: str, now: datetime) -> Ticket:
+        ticket = Ticket(
+            self._runtime.fresh_id(), Demand("expire", demand, demand=demand, is_complete=True), now
+        )
+
+        def tell(future: Future[Receipt]) -> None:
+            self._tried[demand] = now
+            error = future.exception()
+            if isinstance(error, InvalidInput):  # no client gets this error, so report it here
+                self._runtime.failed(f"end of the lease of {quoted(demand)}", error)
+            elif error is None:
+                outcome = future.result().outcome
+                log.info("the lease of %s has ended: %s", quoted(demand), outcome)
+
+        ticket.future.add_done_callback(tell)
+        return ticket
+
+    def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
+        """Return the current time, and the claims whose lease has ended, earliest end first."""
+        now = self._read_clocks()
+        ended = ledger.ended_claims(now)
+        # A demand's claims are released together. So if one gets more time after a jump of the
+        # clock, none is released.
+        granted = {claim.demand for claim in ended if not self._has_ended(claim, now)}
+        return now, [claim for claim in ended if claim.demand not in granted]
+
+    def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
+        first = ledger.first_to_end()
+        if first is not self._first:  # a search is slow if many leases end at one time
+            self._first, self._next_end = first, ledger.next_lease_end()
+        end = self._next_end
+        return longest if end is None else _seconds_until(end, self._read_clocks(), longest)
+
+    def _read_clocks(self) -> datetime:
+        wall, steady = self._runtime.now(), self._runtime.monotonic()
+        expected = self._last[0] + timedelta(seconds=steady - self._last[1])
+        if wall - expected > _JUMP:
+            jump = (wall - expected).total_seconds()
+            log.warning("the clock jumped forward by %.0f s, so leases get their full term", jump)
+            self._jumped_at = wall
+        self._last = (wall, steady)
+        return wall
+
+    def _has_ended(self, claim: Claim, now: datetime) -> bool:
+        if claim.lease is None or self._jumped_at is None:
+            return claim.lease is not None
+        return now > self._jumped_at + timedelta(seconds=claim.lease.seconds + claim.lease.slack)
+
+
+class OverrideExpiry:
+    def __init__(self) -> None:
+        # By name and end: an override whose end a person changes is tried again at once.
+        self._retry_at: dict[tuple[str, datetime | None], datetime] = {}
+        # Before this time no end counts as due, but each batch of demands still commits the ends.
+        self.not_before = datetime.min.replace(tzinfo=timezone.utc)
+
+    def end_due(self, commits: CommitBatch, now: datetime) -> None:
+        for override in expired_overrides(commits.head.state, now):
+            if self._retry_at.get((override.name, override.end), now) > now:
+                continue
+            try:
+                commits.end_override(override, now)
+                log.info("%s ended as planned at %s", override.path, override.expires)
+            except InvalidInput as error:
+                self._retry_at[override.name, override.end] = now + RETRY
+                for problem in error.faults:
+                    log.error("%s cannot be ended: %s; trying again later", override.path, problem)
+
+    def is_due(self, world: World, now: datetime) -> bool:
+        return any(time <= now for time in self._due_times(world))
+
+    def seconds_until_due(self, world: World, now: datetime, longest: float) -> float:
+        times = self._due_times(world)
+        return _seconds_until(min(times), now, longest) if times else longest
+
+    def _due_times(self, world: World) -> list[datetime]:
+        return [
+            max(self._retry_at.get((override.name, override.end), override.end), self.not_before)
+            for override in world.overrides
+            if override.end
+        ]
+
+
+def _seconds_until(time: datetime, now: datetime, longest: float) -> float:
+    return min(max((time - now).total_seconds() + 0.01, _SHORTEST_S), longest)
+
+
+# ---- drained nodes: placed applications and services move off them ----
+#
+# While any of them cannot move, another attempt is made each minute, and at each change of the
+# configuration.
+
+log = logging.getLogger("demandops")
+
+
+class Draining:
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._tried: dict[str, tuple[Config, datetime]] = {}
+        self._logged: dict[str, frozenset[str]] = {}
+        # by node: the last application that was moved, if others are left for later
+        self.after: dict[str, str] = {}
+
+    def move_due(self, commits: CommitBatch) -> None:
+        now = self._runtime.now()
+        for node in self._due(commits.head.state, now):
+            tried = (commits.head.state.config, now)
+            after = self.after.pop(node, "")
+            try:
+                decision = commits.drain(node, after, self._runtime.fresh_id(), now)
+            except InvalidInput as error:
+                self._tried[node] = tried
+                self._warn(node, map(str, error.faults))
+                continue
+            # a commit may fail to be published, so only a try without commit is recorded
+            assert isinstance(decision.request, Drain)  # noqa: S101 - it was decided
+            if decision.request.last:
+                self.after[node] = decision.request.last
+            elif not decision.files:
+                self._tried[node] = tried
+            for moved in decision.placed:
+                log.info("'%s' is drained: %s", node, moved)
+            self._warn(node, decision.warnings, continued=bool(after))
+
+    def _warn(self, node: str, stays: Iterable[str], *, continued: bool = False) -> None:
+        # the texts of the last try are not logged again, as a try comes each minute
+        texts, logged = frozenset(stays), self._logged.get(node, frozenset())
+        for text in sorted(texts - logged):
+            log.warning("'%s' is drained: %s", node, text)
+        self._logged[node] = texts | logged if continued else texts
+
+    def is_due(self, world: World) -> bool:
+        return bool(self._due(world, self._runtime.now()))
+
+    def _due(self, world: World, now: datetime) -> list[str]:
+        nodes = []
+        for node in world.config.drained_nodes:
+            # not for a minute after a try, unless a person changed the configuration or the clock
+            config, at = self._tried.get(node, (None, now))
+            is_new = config is not world.config or not at <= now < at + RETRY
+            if is_new and world.ledger.applications_on.get(node):
+                nodes.append(node)
+        return nodes
+
+
+# ---- the demands that wait for room: when they are tried again, and in which order ----
+#
+# If there may be room, the generator tries the waiting demands before it decides new demands. So no
+# demand gets the room for which an earlier demand, or a demand of higher priority, was waiting.
+
+# After this processor time, new demands come before the waiting demands that were not tried yet.
+_LONGEST_ROUND_S = 0.25
+
+
+class WaitingTurns:
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._tried: World | None = None
+        self.left: list[str] = []  # demands that the last round left for later
+
+    def book_due(self, commits: CommitBatch) -> None:
+        state = commits.head.state
+        if not self.is_due(state):
+            return
+        if not self._is_tried(state) or not self.left:
+            self.left = [waiting.demand for waiting in in_turn(state.ledger.waiting)]
+        end = self._runtime.processor_s() + _LONGEST_ROUND_S
+        while self.left:
+            demand = self.left.pop(0)
+            state, now = commits.head.state, self._runtime.now()
+            if (waiting := state.ledger.waiting.get(demand)) is None:  # it was released meanwhile
+                continue
+            checkpoint = within(state.config.repo_settings.limits, self._runtime)
+            try:
+                decision = decide(state, waiting.put, now, commits.read, checkpoint=checkpoint)
+            except InvalidInput as error:
+                log.debug("demand %s still waits: %s", quoted(demand), error)
+                if isinstance(error, OverLimit):  # a template took too long, and the next may too
+                    break
+            else:
+                if decision.outcome == "booked" and not decision.approval:
+                    commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
+                    log.info("demand %s no longer waits", quoted(demand))
+            if self._runtime.processor_s() > end:  # after a try, so that each round gets on
+                break
+        self._tried = commits.head.state
+
+    def follow(self, commits: CommitBatch, before: State) -> None:
+        """Book waiting demands if the last demand, decided on ``before``, freed room."""
+        if commits.frees:
+            commits.frees = False
+            self._tried = None
+            self.book_due(commits)
+        elif self._tried is before:  # the last demand freed no room, so the tries are still valid
+            self._tried = commits.head.state
+
+    def is_due(self, state: State) -> bool:
+        return bool(state.ledger.waiting) and (bool(self.left) or not self._is_tried(state))
+
+    def _is_tried(self, state: World) -> bool:
+        # by identity: ledger and configuration are frozen, and to compare their content takes long
+        tried = self._tried
+        return tried is not None and tried.ledger is state.ledger and tried.config is state.config
+
+
+# ---- all of this work, in its order ----
+
+
+class Agenda:
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._override_expiry = OverrideExpiry()
+        self._draining = Draining(runtime)
+        self.waiting_turns = WaitingTurns(runtime)
+
+    def commit_due(self, commits: CommitBatch) -> None:
+        # what runs moves before what waits is booked
+        self._override_expiry.end_due(commits, self._runtime.now())
+        self._draining.move_due(commits)
+        self.waiting_turns.book_due(commits)
+
+    def postpone(self) -> None:
+        # because a fetch or a publication failed
+        self._override_expiry.not_before = self._runtime.now() + RETRY
+        self._draining.after.clear()
+        self.waiting_turns.left.clear()
+
+    def is_due(self, state: State) -> bool:
+        return (
+            self._override_expiry.is_due(state, self._runtime.now())
+            or self._draining.is_due(state)
+            or self.waiting_turns.is_due(state)
+        )
+
+    def seconds_until_due(self, state: State, longest: float) -> float:
+        # what was left off goes on at once, but after the demands that arrived meanwhile
+        if self._draining.after or self.waiting_turns.left:
+            return 0.0
+        return self._override_expiry.seconds_until_due(state, self._runtime.now(), longest)
