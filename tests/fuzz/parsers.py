@@ -280,12 +280,11 @@ def end_of_override(data: bytes) -> None:
 
 
 def journal_line(data: bytes) -> None:
-    for entry in journal.parse(data, Path("journal")).values():
-        ticket = ticket_from_journal(entry)
+    for record in journal.parse(data, Path("journal")).values():
+        ticket = ticket_from_journal(record)
         assert ticket.received < NOW.replace(year=9999)
-        assert [*journal.parse(journal._sealed([entry.record()], "")[0], Path())] == [
-            entry.operation
-        ]
+        again = journal.parse(journal._sealed([record], "")[0], Path())
+        assert again == {ticket.operation: record}
 
 
 def commit(data: bytes) -> None:

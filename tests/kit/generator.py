@@ -44,6 +44,11 @@ def outcome(ticket: Ticket) -> str:
     return type(error).__name__ if error else receipt(ticket).outcome
 
 
+def journaled(operation: str, goal: object, received: str, base: str) -> dict[str, object]:
+    """Return a line of the journal of a generator that died before it answered a demand."""
+    return {"operation": operation, "goal": goal, "received": received, "base": base}
+
+
 def wait_until_queued(tickets: Iterable[Ticket]) -> None:
     for ticket in tickets:
         assert ticket.journaled.result(PATIENCE_S)

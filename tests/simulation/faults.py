@@ -376,10 +376,10 @@ _known = set[str]()
 """The demands whose proposals a generator has forgotten at a restart."""
 
 
-def _forget_proposal(resumed: Any, entry: Any) -> Ticket:
-    if entry.proposal:
-        _known.add(entry.goal.get("demand", ""))
-    return resumed(replace(entry, proposal=None))
+def _forget_proposal(resumed: Any, record: Any) -> Ticket:
+    if record.get("proposal"):
+        _known.add(record["goal"].get("demand", ""))
+    return resumed({key: value for key, value in record.items() if key != "proposal"})
 
 
 @wrong(6, permission, "approval_reasons")

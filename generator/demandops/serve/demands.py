@@ -19,7 +19,7 @@ journals what has arrived. The worker's thread makes all other changes of state.
 from __future__ import annotations
 
 import logging
-from collections import Counter, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
@@ -38,11 +38,11 @@ from demandops.base.errors import (
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
 from demandops.cluster.health import Target
-from demandops.decide.decision import Decision, Outcome
+from demandops.decide.decision import Outcome
 from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger.ledger import ClaimChange
-from demandops.repo.write.journal import Journal, JournalEntry, ProposalRecord
+from demandops.repo.write.journal import Journal, ProposalRecord, Record
 
 # ---- a demand under way, from its submission to its receipt ----
 
@@ -63,7 +63,7 @@ Stage = Literal[
 ]
 Listener = Callable[[Stage, str], None]
 
-# Only demandops.serve.demand_lifecycle changes the state of a demand.
+# Only :class:`Demands` changes the state of a demand.
 State = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done"]
 
 
@@ -100,6 +100,9 @@ class Ticket:
     # claim.
     has_released: bool = False
     state: State = "queued"
+    # while it is in the queue: its place in the order of arrival, and what it touches (None: any)
+    number: int = 0
+    subjects: frozenset[Hashable] | None = None
     notified: set[str] = field(default_factory=set)
     proposal: ProposalRecord | None = None
 
@@ -133,35 +136,20 @@ class Ticket:
         if not self.maybe_published:  # the oldest base counts, because any try may have succeeded
             self.base, self.maybe_published = base, True
 
-    def journal_entry(self, proposal: ProposalRecord | None = None) -> JournalEntry:
-        received = self.received.isoformat()
-        return JournalEntry(self.operation, self.demand.goal, received, self.base, proposal)
+    def record(self, proposal: ProposalRecord | None = None) -> Record:
+        # for the journal
+        return {
+            "operation": self.operation,
+            "goal": self.demand.goal,
+            "received": self.received.isoformat(),
+            "base": self.base,
+            **({"proposal": proposal} if proposal else {}),
+        }
 
 
-def receipt_of(
-    ticket: Ticket, decision: Decision, commit: str, targets: tuple[Target, ...]
-) -> Receipt:
-    return Receipt(
-        operation=ticket.operation,
-        request_id=decision.request.id,
-        outcome=decision.outcome,
-        commit=commit,
-        warnings=decision.warnings,
-        not_held=decision.changes.not_held,
-        placed=decision.placed,
-        lease_s=decision.lease_s,
-        targets=targets,
-        changes=decision.changes.claims,
-    )
-
-
-def reason_of(error: DemandOpsError) -> str:
-    return error.text_with_codes() if isinstance(error, InvalidInput) else str(error)
-
-
-def ticket_from_journal(entry: JournalEntry) -> Ticket:
-    demand = read_journaled(entry.goal)
-    ticket = Ticket(entry.operation, demand, datetime.fromisoformat(entry.received))
+def ticket_from_journal(record: Record) -> Ticket:
+    demand = read_journaled(record["goal"])
+    ticket = Ticket(record["operation"], demand, datetime.fromisoformat(record["received"]))
     name = f"demand {ticket.operation} ({quoted(demand.id)}) from the journal"
 
     def tell(stage: Stage, text: str) -> None:
@@ -172,10 +160,10 @@ def ticket_from_journal(entry: JournalEntry) -> Ticket:
 
     ticket.listener = tell
     ticket.journaled.set_result(True)
-    ticket.mark_maybe_published(entry.base)  # the earlier run may have ended after the push
-    if entry.proposal is not None:
-        ticket.proposal = entry.proposal
-        ticket.state = "withdrawn" if ticket.proposal.withdrawn else "proposed"
+    ticket.mark_maybe_published(record["base"])  # the earlier run may have ended after the push
+    if (proposal := record.get("proposal")) is not None:
+        ticket.proposal = proposal
+        ticket.state = "withdrawn" if proposal.withdrawn else "proposed"
     return ticket
 
 
@@ -189,15 +177,7 @@ def ticket_from_journal(entry: JournalEntry) -> Ticket:
 # - A rollback or a decommission may touch any subject, so it overtakes no demand, and no demand
 #   overtakes it.
 
-
-@dataclass(eq=False)
-class _Queued:
-    number: int  # the order of arrival
-    ticket: Ticket
-    subjects: frozenset[Hashable] | None  # None: any
-    # A removal only marks the demand, because a search in each deque would be slow; `_next_in`
-    # drops those that have left.
-    has_left: bool = False
+_Line = OrderedDict[Ticket, None]  # a set in order, which loses any member at once
 
 
 class FairQueue:
@@ -206,10 +186,11 @@ class FairQueue:
 
     def __init__(self, *, in_order: bool = False) -> None:
         self._in_order = in_order
-        self._queued: dict[Ticket, _Queued] = {}
-        self._lanes: dict[str, deque[_Queued]] = {}
-        self._subjects: dict[Hashable, deque[_Queued]] = {}
-        self._barriers: deque[_Queued] = deque()
+        self._queued = OrderedDict[Ticket, None]()
+        # The lines in which the demands stand: of their requesters, and of what they touch, where
+        # None is the line of those that may touch anything. No line is empty.
+        self._lanes = OrderedDict[Hashable, _Line]()
+        self._subjects: dict[Hashable, _Line] = {}
         self._arrived = 0
 
     def __len__(self) -> int:
@@ -217,79 +198,69 @@ class FairQueue:
 
     def append(self, ticket: Ticket) -> None:
         self._arrived += 1
-        queued = _Queued(self._arrived, ticket, ticket.demand.touches())
-        self._queued[ticket] = queued
-        self._lanes.setdefault(self._lane(ticket), deque()).append(queued)
-        for subject in queued.subjects or ():
-            self._subjects.setdefault(subject, deque()).append(queued)
-        if queued.subjects is None:
-            self._barriers.append(queued)
+        ticket.number, ticket.subjects = self._arrived, ticket.demand.touches()
+        self._queued[ticket] = None
+        for lines, key in self._places(ticket):
+            lines.setdefault(key, OrderedDict())[ticket] = None
 
     def put_back(self, tickets: Sequence[Ticket], served: Iterable[Ticket] = ()) -> None:
         # In the order in which they left, each before others of its requester. Their requesters get
         # the next turns. But a requester of ``served``, demands that left with them and do not come
         # back, had its turn and comes after all others.
-        first = min((queued.number for queued in self._queued.values()), default=1) - len(tickets)
-        again = {
-            ticket: _Queued(number, ticket, ticket.demand.touches())
-            for number, ticket in enumerate(tickets, start=first)
-        }
-        lanes = dict.fromkeys(map(self._lane, tickets))
-        self._lanes = {name: self._lanes.pop(name, deque()) for name in lanes} | self._lanes
-        for name in dict.fromkeys(map(self._lane, served)):
-            if name in self._lanes:
-                self._lanes[name] = self._lanes.pop(name)
-        for queued in reversed(again.values()):
-            self._lanes[self._lane(queued.ticket)].appendleft(queued)
-            for subject in queued.subjects or ():
-                self._subjects.setdefault(subject, deque()).appendleft(queued)
-            if queued.subjects is None:
-                self._barriers.appendleft(queued)
-        self._queued = again | self._queued
+        number = next(iter(self._queued)).number if self._queued else 1
+        for ticket in reversed(tickets):
+            number -= 1
+            ticket.number = number
+            self._queued[ticket] = None
+            self._queued.move_to_end(ticket, last=False)
+            lane, *subjects = self._places(ticket)
+            for lines, key in (lane, *subjects):
+                lines.setdefault(key, OrderedDict())[ticket] = None
+                lines[key].move_to_end(ticket, last=False)
+            self._lanes.move_to_end(lane[1], last=False)
+        for requester in dict.fromkeys(ticket.requester for ticket in served):
+            if requester in self._lanes:
+                self._lanes.move_to_end(requester)
 
-    def remove(self, tickets: Collection[Ticket]) -> None:
+    def remove(self, tickets: Iterable[Ticket]) -> None:
         for ticket in tickets:
-            if (queued := self._queued.pop(ticket, None)) is not None:
-                queued.has_left = True
+            if ticket in self._queued:
+                del self._queued[ticket]
+                for lines, key in self._places(ticket):
+                    del lines[key][ticket]
+                    if not lines[key]:  # many ids come only once; keep none of them
+                        del lines[key]
 
     def popleft(self) -> Ticket:
-        while True:
-            requester = next(iter(self._lanes))
-            lane = self._lanes.pop(requester)
-            if (first := _next_in(lane)) is not None:
-                self._lanes[requester] = lane  # at the end, so that the other requesters come first
-                break
+        requester, lane = next(iter(self._lanes.items()))
+        self._lanes.move_to_end(requester)  # so that the other requesters come first
+        first = next(iter(lane))
         # whoever has the turn, related demands leave in the order in which they came
         while (predecessor := self._predecessor(first)) is not None:
             first = predecessor
-        self.remove([first.ticket])
-        for subject in first.subjects or ():  # many ids come only once; keep none of them
-            if _next_in(self._subjects[subject]) is None:
-                del self._subjects[subject]
-        return first.ticket
+        self.remove([first])
+        return first
 
-    def _lane(self, ticket: Ticket) -> str:
-        return "" if self._in_order else ticket.requester
+    def _places(self, ticket: Ticket) -> list[tuple[dict[Hashable, _Line], Hashable]]:
+        subjects = (None,) if ticket.subjects is None else ticket.subjects
+        lane = "" if self._in_order else ticket.requester
+        return [(self._lanes, lane), *((self._subjects, subject) for subject in subjects)]
 
-    def _predecessor(self, queued: _Queued) -> _Queued | None:
-        if (barrier := _next_in(self._barriers)) is not None and barrier.number < queued.number:
-            return barrier
-        if queued.subjects is None:
-            oldest = next(iter(self._queued.values()))
-            return oldest if oldest is not queued else None
-        for subject in queued.subjects:
-            if (first := _next_in(self._subjects[subject])) is not None and first is not queued:
+    def _predecessor(self, ticket: Ticket) -> Ticket | None:
+        if ticket.subjects is None:
+            oldest = next(iter(self._queued))
+            return oldest if oldest is not ticket else None
+        if None in self._subjects:
+            first = next(iter(self._subjects[None]))
+            if first.number < ticket.number:
+                return first
+        for subject in ticket.subjects:
+            if (first := next(iter(self._subjects[subject]))) is not ticket:
                 return first
         return None
 
 
-def _next_in(lane: deque[_Queued]) -> _Queued | None:
-    while lane and lane[0].has_left:
-        lane.popleft()
-    return lane[0] if lane else None
-
-
-log = logging.getLogger("demandops")
+# ---- the states of the demands ----
 
 TAKEN_BACK = "the demand was taken back before it was committed"
 
@@ -312,7 +283,7 @@ class Demands:
         self._limit, self._requester_limit = limit, requester_limit
         self._of_requester = Counter[str]()
         self._changed = runtime.condition()
-        resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
+        resumed = [ticket_from_journal(record) for record in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
@@ -322,7 +293,7 @@ class Demands:
             if ticket.proposal is None:
                 self._enqueue(ticket)
         self._taken_back: list[Ticket] = []
-        self._closed = self._woken = False
+        self.is_closed = self._woken = False
         # Why no demand can be published now, or empty. QueueFull quotes it: a queue that is full
         # behind a remote that is away needs another remedy than a client that sends too much.
         self.blocked = ""
@@ -344,15 +315,11 @@ class Demands:
     def unpublished(self) -> int:
         """The number of demands still to publish: those in the journal that await no approval."""
         with self._changed:
-            return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
+            return sum(1 for each in self._journal.pending.values() if "proposal" not in each)
 
     @property
     def has_queued(self) -> bool:
         return bool(self._arrived or self._queue)
-
-    @property
-    def must_not_wait(self) -> bool:
-        return self.has_queued or self._closed
 
     # ---- waiting for demands ----
 
@@ -360,7 +327,7 @@ class Demands:
         """Accept no further demands; the demands that have arrived are still carried out."""
         self._take_in()  # what came before is accepted
         with self._changed:
-            self._closed = True
+            self.is_closed = True
             self._changed.notify()
         self._take_in()  # what came between the two is refused; no thread would look at it again
         self._arrival.set()
@@ -373,22 +340,21 @@ class Demands:
     def wait(self, timeout: float | None) -> bool:
         """Wait for a demand, :meth:`wake` or :meth:`close`; false once no demand will come."""
         with self._changed:
-            self._wait(timeout, self.must_not_wait)
-            return self.has_queued or not self._closed
+            if not (self._woken or self.is_closed or self.has_queued):
+                self._changed.wait(timeout)
+            self._woken = False
+            return self.has_queued or not self.is_closed
 
     def new_demands(self, timeout: float) -> list[Ticket]:
         """Return the demands accepted since this or :meth:`take` was called; wait if none is."""
         with self._changed:
-            self._wait(timeout, bool(self._new))
+            if not (self._woken or self._new):
+                self._changed.wait(timeout)
+            self._woken = False
             # after a failed write the state of the journal is unknown, so the process must end
             self._journal.require_sound()
             new, self._new = self._new, []
             return new
-
-    def _wait(self, timeout: float | None, has_work: bool) -> None:
-        if not has_work and not self._woken:
-            self._changed.wait(timeout)
-        self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
         self._take_in()
@@ -415,12 +381,12 @@ class Demands:
         ticket.state = "arrived"
         self._arrived.append(ticket)
         self._arrival.set()
-        if self._closed:  # that thread may have ended, so refuse the demand here
+        if self.is_closed:  # that thread may have ended, so refuse the demand here
             self._take_in()
 
     def journal_arrivals(self) -> None:
         # demands that arrive during an fsync of the journal share the next fsync
-        while not self._closed:
+        while not self.is_closed:
             self._arrival.wait()
             self._arrival.clear()
             self._take_in()
@@ -439,7 +405,7 @@ class Demands:
                 self._tickets[ticket.operation] = ticket
                 taken.append(ticket)
             try:
-                self._journal.append(ticket.journal_entry() for ticket in taken)
+                self._journal.append(ticket.record() for ticket in taken)
             except Exception as failure:
                 if isinstance(failure, DemandOpsError):
                     why = failure
@@ -464,7 +430,7 @@ class Demands:
             ticket.refuse(error)
 
     def _why_refused(self, ticket: Ticket, others: int) -> DemandOpsError | None:
-        if self._closed:
+        if self.is_closed:
             return ShuttingDown("the generator is shutting down; send the demand again later")
         # the others were accepted just before, and are not queued yet
         if others + len(self._queue) >= self._limit:
@@ -491,9 +457,9 @@ class Demands:
     def propose(self, ticket: Ticket, record: ProposalRecord) -> bool:
         """Journal the proposal of a demand; false if it is withdrawn or answered already."""
         with self._changed:
-            if not _may_become(ticket, "proposed"):
+            if "proposed" not in _NEXT[ticket.state]:
                 return False
-            self._journal.append([ticket.journal_entry(record)])
+            self._journal.append([ticket.record(record)])
             self._leave(ticket)
             ticket.proposal = record
             return _change(ticket, "proposed")
@@ -502,7 +468,7 @@ class Demands:
         with self._changed:
             for ticket in tickets:
                 ticket.mark_maybe_published(ticket.base)  # a person may have merged it meanwhile
-                self._journal.append([ticket.journal_entry()])
+                self._journal.append([ticket.record()])
                 ticket.proposal = None
                 _change(ticket, "queued")
                 self._enqueue(ticket)
@@ -512,7 +478,7 @@ class Demands:
         self._take_in()
         with self._changed:
             ticket = self._tickets.get(operation)
-            if ticket is None or not _may_become(ticket, "withdrawn"):
+            if ticket is None or "withdrawn" not in _NEXT[ticket.state]:
                 return ticket is not None and ticket.state == "withdrawn"
             try:
                 self._withdraw(ticket, TAKEN_BACK)
@@ -535,7 +501,7 @@ class Demands:
             self._taken_back.append(ticket)
         else:  # the demand stays in the journal until its branch is deleted
             record = replace(ticket.proposal, withdrawn=reason)
-            self._journal.append([ticket.journal_entry(record)])
+            self._journal.append([ticket.record(record)])
             ticket.proposal = record
         _change(ticket, "withdrawn")
         self.wake()  # the worker answers the demand even while nothing can be published
@@ -561,7 +527,8 @@ class Demands:
             if isinstance(result, Receipt) or ticket.state == "done":
                 continue
             if str(result) != TAKEN_BACK:  # a client that took its demand back needs no notice
-                ticket.notify("refused", reason_of(result))
+                text = result.text_with_codes() if isinstance(result, InvalidInput) else str(result)
+                ticket.notify("refused", text)
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
             if not keep:
@@ -614,11 +581,7 @@ class Demands:
             self._of_requester -= Counter([ticket.requester])
 
 
-def _may_become(ticket: Ticket, state: State) -> bool:
-    return state in _NEXT[ticket.state]
-
-
 def _change(ticket: Ticket, state: State) -> bool:
-    if _may_become(ticket, state):
+    if state in _NEXT[ticket.state]:
         ticket.state = state
     return ticket.state == state

@@ -492,7 +492,9 @@ class Worker:
         try:
             if self._timer.start_if_due():
                 # a demand that arrives ends the fetch, because its push finds new commits too
-                self._repository.refresh(lambda: self._demands.must_not_wait)
+                self._repository.refresh(
+                    lambda: self._demands.has_queued or self._demands.is_closed
+                )
             # in a repository on this disk, each turn reads the tip, because that is cheap
             elif not (self._repository.always_current or is_due):
                 return

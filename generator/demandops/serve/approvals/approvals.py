@@ -53,7 +53,7 @@ from demandops.serve.approvals.proposal import (
     releases,
     waiting_text,
 )
-from demandops.serve.demands import TAKEN_BACK, Demands, Receipt, Ticket, receipt_of
+from demandops.serve.demands import TAKEN_BACK, Demands, Receipt, Ticket
 
 log = logging.getLogger("demandops")
 
@@ -297,8 +297,18 @@ class Approvals:
         return replace(receipt, outcome="booked")
 
     def receipt(self, ticket: Ticket, decision: Decision, commit: str, before: State) -> Receipt:
-        targets = targets_of_decision(before, decision) if self._with_targets else ()
-        return receipt_of(ticket, decision, commit, targets)
+        return Receipt(
+            operation=ticket.operation,
+            request_id=decision.request.id,
+            outcome=decision.outcome,
+            commit=commit,
+            warnings=decision.warnings,
+            not_held=decision.changes.not_held,
+            placed=decision.placed,
+            lease_s=decision.lease_s,
+            targets=targets_of_decision(before, decision) if self._with_targets else (),
+            changes=decision.changes.claims,
+        )
 
     # ---- the branch and its pull request ----
 
