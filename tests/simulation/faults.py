@@ -37,7 +37,7 @@ from demandops.serve import agenda, demands, generator
 from demandops.serve.agenda import Draining, LeaseExpiry, WaitingTurns
 from demandops.serve.approvals.approvals import Approvals
 from demandops.serve.demands import Demands, Receipt, Ticket
-from demandops.serve.worker import Evaluator, Worker
+from demandops.serve.worker import Worker
 
 Wrong = Callable[..., Any]
 """A wrong function or property; its first argument is the right one, whose arguments follow."""
@@ -251,10 +251,14 @@ plant("run_what_is_denied", 26, release_keys, "without_suspended", itself)
 plant("book_what_is_denied", 27, quotas, "denial_faults", lambda *_: ())
 
 
-@wrong(6, agenda, "expired_overrides")
 @wrong(10, relocation, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
+
+
+@wrong(6, agenda, "_ends")
+def end_overrides_early_one_by_one(ends: Any, state: Any) -> Any:
+    return [(end - timedelta(minutes=2), name) for end, name in ends(state)]
 
 
 # ---- publishing ----
@@ -357,7 +361,7 @@ def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
 
 
 plant("resume_in_reverse", 1, journal, "read", lambda read, path: dict([*read(path).items()][::-1]))
-plant("skip_the_search_for_operations", 22, Evaluator, "published_before", lambda *_: [])
+plant("skip_the_search_for_operations", 22, Worker, "_published_before", lambda *_: [])
 
 
 @wrong(30, generator.state_in_effect, "first_snapshot")

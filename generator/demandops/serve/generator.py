@@ -21,7 +21,7 @@ from demandops.repo.history import revisions
 from demandops.repo.load import state_in_effect
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.write.journal import Slot
-from demandops.serve.agenda import Heartbeat
+from demandops.serve.agenda import heartbeat_in
 from demandops.serve.approvals.approvals import Approvals
 from demandops.serve.demands import Demands, Listener, Ticket
 from demandops.serve.worker import RemoteStatus, Worker
@@ -56,7 +56,7 @@ class Generator:
         progress: Progress = lambda done, total: None,
         runtime: Runtime = REAL,
     ) -> None:
-        heartbeat = Heartbeat(settings.alive_file())
+        heartbeat = heartbeat_in(settings.alive_file())
         signer = Signer(signing_key) if signing_key else None
         try:
             self._slot = Slot(data or settings.data_home(state_repo))
