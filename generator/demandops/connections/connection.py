@@ -169,20 +169,17 @@ def _type_field() -> PlainValidator:
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """One connection and the topics that it carries.
-
-    The connection of a claim has a type, and its routes are sorted by source topic, without
-    duplicates (:meth:`booked`).
-    """
+    """One connection and the topics that it carries."""
 
     __pydantic_config__: ClassVar = PART
 
     id: str = ""
-    # None if a demand leaves it open
+    # None if a demand leaves it open; that of a claim is not None
     type: Annotated[
         ConnectionType | None,
         _type_field(),
         PlainSerializer(lambda kind: kind.word, when_used="unless-none"),
+        Field(json_schema_extra={"default": "auto"}),
     ] = None
     source: str = ""
     target: str = ""

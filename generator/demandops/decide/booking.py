@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 
@@ -24,22 +24,9 @@ from demandops.model.ledger.claim import Claim, ClaimKey, demand_id, requesters_
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
 from demandops.model.ledger.records import Wait
 
-# ---- owners: the requesters for whom a demand that has an id holds claims or waits ----
-#
-# A request is refused if it names none of the owners. So if a second requester chooses the same
-# demand id by chance, its requests cannot change the demand of the first requester.
 
-
-def is_waiting(ledger: Ledger, request: Demand) -> bool:
-    """Return whether the request's demand waits; raise Refused if it is of others."""
-    waiting = ledger.waiting.get(request.demand)
-    if waiting is not None:
-        refuse_other_owners(waiting.requesters, request)
-    return waiting is not None
-
-
-def owned_claims(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
-    """Return the claims of the demand; raise Refused if it holds none or is of others."""
+def claims_of(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
+    """Return the claims of the request's demand; raise Refused if it holds none."""
     held = ledger.claims_of_demand(request.demand)
     if not held:
         demands = sorted(
@@ -55,17 +42,7 @@ def owned_claims(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
             hint = f"the requesters of this request hold, for example, {', '.join(demands[:5])}"
         message = f"'{request.demand}' holds nothing; {hint}"
         raise Refused.at("demand", message, code="not-held")
-    refuse_other_owners(requesters_of(held), request)
     return held
-
-
-def refuse_other_owners(owners: Sequence[str], request: Demand) -> None:
-    if owners and not set(owners) & set(request.requesters()):
-        message = (
-            f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; name one of them, or "
-            "choose another demand id"
-        )
-        raise Refused.at("demand", message, code="not-yours")
 
 
 # ---- conflicts: a demand contradicts existing claims on the same application or connection ----
@@ -220,8 +197,7 @@ def put(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes
     # After a put, a demand with an id holds exactly what the put lists.
     start, demand = ledger, request.demand
     held = ledger.claims_of_demand(demand)
-    refuse_other_owners(requesters_of(held), request)
-    waited = (demand,) * is_waiting(ledger, request)
+    waited = (demand,) * (demand in ledger.waiting)
     # the demand's own claims are no contradiction, because a put may move its own applications
     ledger = others = ledger.without(held)
     faults: list[Fault] = []
@@ -253,18 +229,16 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
         claim = ledger.get(ClaimKey(subject, demand_id(request.id, item.requesters)))
         if claim and not (claim.joined and claim.held.matches_listed(item.held)):
             claim = None
-        listed = [words for words, _ in item.held.listed_topics(item.held)]
         if claim is None:
-            not_held += [f"{subject}: {words} for {who}" for words in listed]
-            not_held += [] if listed else [f"{subject} for {who}"]
-        elif not listed:
-            taken.setdefault(claim.key, set()).update(claim.held.topic_keys())
-        else:
-            for words, held in claim.held.listed_topics(item.held):
-                if held:
-                    taken.setdefault(claim.key, set()).update(held)
-                else:
-                    not_held.append(f"{subject}: {words} for {who}")
+            not_held.append(f"{subject} for {who}")
+            continue
+        listed = list(claim.held.listed_topics(item.held))
+        topics = {key for _, keys in listed for key in keys}
+        if not listed:
+            topics = {*claim.held.topic_keys()}
+        if topics:
+            taken.setdefault(claim.key, set()).update(topics)
+        not_held += [f"{subject}: {words} for {who}" for words, keys in listed if not keys]
     if not taken:
         similar = [
             f"{claim.subject} for {', '.join(claim.requesters)} ("
@@ -282,8 +256,8 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
         ]
         shown = "; ".join(dict.fromkeys(similar[:5])) or "none"
         message = (
-            f"nothing that the shutdown lists is held by the request '{request.id}' of these "
-            f"requesters; similar claims: {shown}"
+            f"nothing that the shutdown lists is held by a join with the id '{request.id}' and the "
+            f"same requesters; similar claims: {shown}"
         )
         place = request.demanded[0].fault if request.demanded else fault
         raise Refused([place("id", message, code="not-held")])
@@ -296,8 +270,8 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
 
 
 def release_demand(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
-    waited = (request.demand,) * is_waiting(ledger, request)
-    held = ledger.claims_of_demand(request.demand) if waited else owned_claims(ledger, request)
+    waited = (request.demand,) * (request.demand in ledger.waiting)
+    held = ledger.claims_of_demand(request.demand) if waited else claims_of(ledger, request)
     after = ledger.without(held).without_waiting(waited)
     claims = claim_changes(ledger, after, [claim.key for claim in held])
     return after, Changes(claims=claims, waiting=waited)
@@ -305,9 +279,9 @@ def release_demand(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
 
 def renew_leases(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
     # a demand that waits has no lease yet, but its client may renew it already
-    if is_waiting(ledger, request) and not ledger.claims_of_demand(request.demand):
+    if request.demand in ledger.waiting and not ledger.claims_of_demand(request.demand):
         return ledger, Changes()
-    start, held = ledger, owned_claims(ledger, request)
+    start, held = ledger, claims_of(ledger, request)
     for claim in held:
         if claim.lease is not None:
             term = Term(claim.lease.seconds, claim.lease.slack)

@@ -368,6 +368,8 @@ class Worker:
                     ),
                     within(state.config.repo_settings.limits, self._runtime),
                 )
+            if self._approvals.proposals:
+                self._approvals.refuse_strangers(decision)
             if decision.approval:
                 return decision
             # from here on the demand can no longer be taken back
