@@ -29,9 +29,9 @@ from demandops.model.config.override import Override
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import claim_changes
-from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
+from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
 from demandops.repo.load.snapshot import Advance, Snapshot
@@ -99,9 +99,9 @@ class CommitBatch:
         committer = commit_message.generator_signature(now)
         for attempt in range(1, _ATTEMPTS + 1):
             try:
-                tree = trees.write(self._repository.new, self._tree, files)
-                commit = signing.create_commit(
-                    self._repository.new,
+                new = self._repository.new
+                tree = new.add_tree(self._tree, files)
+                commit = new.add_commit(
                     self._repository.signer,
                     (author, committer),
                     text,
@@ -110,7 +110,7 @@ class CommitBatch:
                 )
                 self._tree = trees.commit_of(self._objects, commit).tree
                 break
-            except signing.SigningFailed:
+            except SigningFailed:
                 raise
             except (OSError, pygit2.GitError, KeyError, StateRepoError):
                 # a concurrent `git gc` may move an object to another file while it is read

@@ -179,7 +179,7 @@ class ProposalBranches:
         except StateRepoError:
             return None  # the clone was made again, or `git gc` removed the commit
         now = commit_of(objects, tip).tree
-        return old, proposal, now, objects[trees.write(self._repository.new, now, files)].peel(Tree)
+        return old, proposal, now, objects[self._repository.new.add_tree(now, files)].peel(Tree)
 
 
 @dataclass(frozen=True, slots=True)
