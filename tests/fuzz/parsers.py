@@ -33,7 +33,7 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.repo.forge import ForgeError, Gitea, GitHub
 from demandops.repo.git import local_repository as addresses
-from demandops.repo.history import commit_log, revisions
+from demandops.repo.history import commit_log, commit_message, revisions
 from demandops.repo.write import journal
 from demandops.serve.demands import ticket_from_journal
 from demandops.serve.http_server import PushWebhook
@@ -304,7 +304,7 @@ def commit(data: bytes) -> None:
     entry = commit_log.entry_of(found)
     assert entry.by_generator in (True, False)
     commit_log.author_of(found)
-    revisions.format_time(entry.time)
+    commit_message.time_text(entry.time)
 
 
 def address(data: bytes) -> None:

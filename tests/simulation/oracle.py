@@ -18,7 +18,8 @@ from demandops.model.ledger.claim import Claim
 from demandops.repo import verification
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import MAIN
-from demandops.repo.history.commit_log import PROPOSAL, entry_of
+from demandops.repo.history.commit_log import entry_of
+from demandops.repo.history.commit_message import PROPOSAL
 from demandops.serve.demands import Ticket
 
 from tests.kit import plain_yaml

@@ -20,7 +20,7 @@ from demandops.model.config.repo_settings import ROOT_FILE, as_git_url
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.signing import Signer
-from demandops.repo.history import commit_log, commit_message
+from demandops.repo.history import commit_message
 from demandops.templating.evaluator import EVALUATE
 
 # ---- the files: the skeleton, the appdefs and the rendered files ----
@@ -142,7 +142,7 @@ def _write(
     tree = objects.add_tree(None, content)
     why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
     trailers = [("Operation", "init"), ("Render-Version", str(RENDER_VERSION))]
-    text = commit_log.compose([["Create the state repo"], [why]], trailers)
+    text = commit_message.compose([["Create the state repo"], [why]], trailers)
     signature = commit_message.generator_signature(now)
     commit = objects.add_commit(signer, (signature, signature), text, tree, [])
     with objects.packed(commit):

@@ -24,9 +24,8 @@ from demandops.repo import verification
 from demandops.repo.git import tree as trees
 from demandops.repo.git.local_repository import LastFetch, connect, is_url
 from demandops.repo.git.repository import StateRepository, access_error, reading
-from demandops.repo.history import commit_log, commit_message, revisions
-from demandops.repo.history.commit_log import LogEntry, PathHistory
-from demandops.repo.history.commit_message import Person
+from demandops.repo.history import commit_log, revisions
+from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
 from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.verification import Verdict
@@ -248,7 +247,7 @@ class Reader:
         return ledger_files.restoration(self._objects, rollback)
 
     def operator(self) -> Person:
-        return commit_message.operator(self._objects.path)
+        return commit_log.operator(self._objects.path)
 
 
 @contextmanager

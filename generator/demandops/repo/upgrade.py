@@ -92,7 +92,7 @@ def upgrade(
             planned, batch, state, keys = _plan(repository, request, now, progress)
             if not planned.files:
                 return planned
-            who = commit_message.operator(repository.objects.path)
+            who = commit_log.operator(repository.objects.path)
             author = commit_message.signature(who.name, who.email, now)
             text = _message(planned, keys)
             commit = batch.commit_files(planned.files, state, text, author, now)
@@ -220,4 +220,4 @@ def _message(upgrade: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         [f"Why: `demandops upgrade` renders everything {why}."],
         ["Files written or removed:", *files],
     ]
-    return commit_log.compose(paragraphs, trailers)
+    return commit_message.compose(paragraphs, trailers)

@@ -30,7 +30,8 @@ from demandops.render import manifests, release_file
 from demandops.render.gitops import path_of
 from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
-from demandops.repo.history.commit_log import PROPOSAL, LogEntry, entry_of
+from demandops.repo.history.commit_log import LogEntry, entry_of
+from demandops.repo.history.commit_message import PROPOSAL
 from demandops.repo.load import ledger_files, state_in_effect
 
 # ---- the files that a commit of the generator changed, but was not allowed to change ----

@@ -17,7 +17,7 @@ import pytest
 import yaml
 from demandops.base.errors import InvalidInput
 from demandops.base.settings import GENERATED_ROOTS
-from demandops.repo.history import commit_message
+from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot, state_in_effect
 from demandops.serve.generator import Generator
 
@@ -152,13 +152,13 @@ def test_broken_files_are_judged_once_and_not_on_each_demand(
 ) -> None:
     parsed: list[int] = []
     asked: list[str] = []
-    load, origin_of = snapshot.load_config, commit_message.fault_origin
+    load, origin_of = snapshot.load_config, commit_log.fault_origin
 
     def fault_origin(*args: Any) -> Callable[[str], tuple[str, str] | None]:
         origin = origin_of(*args)
         return lambda path: (asked.append(path), origin(path))[1]
 
-    monkeypatch.setattr(commit_message, "fault_origin", fault_origin)
+    monkeypatch.setattr(commit_log, "fault_origin", fault_origin)
     monkeypatch.setattr(
         snapshot, "load_config", lambda files: (parsed.append(len(files)), load(files))[1]
     )

@@ -78,9 +78,9 @@ class CommitBatch:
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
             more += [
-                (commit_log.PROPOSAL, proposal.branch),
-                (commit_log.REPLACES, proposal.replaces),
-                *((commit_log.REQUIRED_BY, reason) for reason in decision.approval),
+                (commit_message.PROPOSAL, proposal.branch),
+                (commit_message.REPLACES, proposal.replaces),
+                *((commit_message.REQUIRED_BY, reason) for reason in decision.approval),
             ]
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
@@ -133,9 +133,7 @@ class CommitBatch:
         self.head, change, keys = self._followed(advance, before, now)
         state, tip, problems = self.head.state, self.head.commit, self.head.problems
         files, reported = dict(change.files), self.read(last_valid_config.PATH)
-        origin = commit_message.fault_origin(
-            self._objects, before.last_valid_commit, self.start.commit
-        )
+        origin = commit_log.fault_origin(self._objects, before.last_valid_commit, self.start.commit)
         report = last_valid_config.write(
             last_valid_config.with_origins(problems, last_valid_config.read(reported), origin)
         )
@@ -148,7 +146,7 @@ class CommitBatch:
             *change.overrides,
             *commit_message.keep_override_paths(keys),
         ]
-        causes = commit_message.person_commits_since(self._objects, before.last_valid_commit, tip)
+        causes = commit_log.person_commits_since(self._objects, before.last_valid_commit, tip)
         text = commit_message.of_follow(
             change.releases,
             str(tip),
@@ -157,12 +155,12 @@ class CommitBatch:
             [
                 *commit_message.override_trailers(overrides),
                 *commit_message.demand_trailers(keys),
-                *commit_message.caused_by_trailers(causes),
+                *commit_log.caused_by_trailers(causes),
                 *state_in_effect.trailers_of(self.head),
             ],
             reports=report != reported,
         )
-        author = commit_message.follow_author(causes, now)
+        author = commit_log.follow_author(causes, now)
         self.commit_files(files, state, text, author, now)
         title = text.partition("\n")[0]
         self.followed = one_line(", ".join([title, *sorted(set(overrides))]))
@@ -220,10 +218,10 @@ class CommitBatch:
             changes = commit_log.changes_to(self._objects, self.start.commit, file)
             by_people = (change.entry for change in changes if not change.entry.by_generator)
             causes = [trees.commit_of(self._objects, e.commit) for e in islice(by_people, 1)]
-            caused_by = commit_message.caused_by_trailers(causes)
+            caused_by = commit_log.caused_by_trailers(causes)
             more = [*caused_by, *state_in_effect.trailers_of(self.head)]
             text = commit_message.of_decision(decision, operation, now, more)
-            author = commit_message.follow_author(causes, now)
+            author = commit_log.follow_author(causes, now)
             self.commit_files(decision.files, decision.state, text, author, now)
         return decision
 

@@ -20,8 +20,8 @@ from demandops.decide.changeset import FileReader
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import MAIN, StateRepository
 from demandops.repo.history import commit_message
-from demandops.repo.history.commit_log import compose
-from demandops.repo.history.commit_message import Person
+from demandops.repo.history.commit_log import Person
+from demandops.repo.history.commit_message import compose
 from demandops.repo.load import last_valid_config
 from demandops.repo.write.proposal_branch import PendingProposal, ProposalBranches
 
