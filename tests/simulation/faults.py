@@ -380,7 +380,7 @@ plant("resume_in_reverse", 1, journal, "read", lambda read, path: dict([*read(pa
 plant("skip_the_search_for_operations", 22, Worker, "_published_before", lambda *_: [])
 
 
-@wrong(30, generator.state_in_effect, "first_snapshot")
+@wrong(30, generator.snapshots, "first_snapshot")
 def start_without_overrides(first: Any, *given: Any) -> Any:
     found = first(*given)
     config = replace(found.state.config, overrides={})

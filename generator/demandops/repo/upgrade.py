@@ -35,7 +35,7 @@ from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import commit_log, commit_message
-from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
+from demandops.repo.load import last_valid_config, ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress
 from demandops.repo.write.commit_batch import CommitBatch
@@ -120,7 +120,7 @@ def _plan(
     config = load(by_people)
     state = State(config, snapshot.state.ledger, EVALUATE)
     # people may have edited since the state in effect; their edits are checked and applied too
-    start = state_in_effect.start_at(objects, tip)
+    start = snapshots.start_at(objects, tip)
     edits = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, start.state.ledger)
     refused = list(faults_of_edit(start.state, state, edits))
     if refused:
@@ -210,7 +210,7 @@ def _message(upgrade: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         ("From-Render-Version", str(old.render_version)),
         ("From-Gitops", old.gitops if upgrade.switches else ""),
         ("Gitops", new.gitops),
-        *commit_message.override_trailers(commit_message.keep_override_paths(keys)),
+        *commit_message.override_trailers((), keys),
         *commit_message.demand_trailers(keys),
         ("Render-Version", str(new.render_version)),
     ]

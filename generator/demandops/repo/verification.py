@@ -32,7 +32,8 @@ from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.history.commit_log import LogEntry, entry_of
 from demandops.repo.history.commit_message import PROPOSAL
-from demandops.repo.load import ledger_files, state_in_effect
+from demandops.repo.load import ledger_files
+from demandops.repo.load import snapshot as snapshots
 
 # ---- the files that a commit of the generator changed, but was not allowed to change ----
 #
@@ -248,7 +249,7 @@ class _Unreadable(Exception):
 
 def _loaded(repo: Repository, entry: LogEntry) -> State:
     try:
-        return state_in_effect.recorded_state(repo, entry).state
+        return snapshots.recorded_state(repo, entry).state
     except InvalidInput as error:
         raise _Unreadable(error.faults[0]) from None
 

@@ -54,9 +54,16 @@ class MessageText:
 
 def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
     # without empty paragraphs and trailers
-    lines = [f"{key}: {_encoded(key, value)}" for key, value in trailers if value]
+    last = []
+    for key, value in ((key, value) for key, value in trailers if value):
+        is_plain = is_visible(value) and value == value.strip() and not _QUOTED.fullmatch(value)
+        if is_plain and (key in _AS_WRITTEN or harmless(value) == value):
+            last.append(f"{key}: {value}")
+        else:
+            text = harmless(escaped(value.replace("\\", r"\\").replace('"', r"\"")))
+            last.append(f'{key}: "{_EDGES.sub(_SPACE, text)}"')
     body = ("\n".join(harmless(one_line(line)) for line in lines) for lines in paragraphs)
-    return "\n\n".join(text for text in (*body, "\n".join(lines)) if text) + "\n"
+    return "\n\n".join(text for text in (*body, "\n".join(last)) if text) + "\n"
 
 
 def parse(message: str) -> MessageText:
@@ -100,7 +107,7 @@ GENERATOR_EMAIL = "generator@demandops.invalid"
 #
 # The trailers are a contract: an auditor without this program finds everything with ``git log
 # --format='%(trailers:key=Requester)'``. Values from outside appear in a message only as
-# :mod:`.commit_log` quotes them. :mod:`.state_in_effect` adds the trailers about quarantined files.
+# :func:`compose` quotes them. :mod:`.snapshot` adds the trailers about quarantined files.
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
@@ -146,15 +153,18 @@ def of_decision(
     request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
     more = list(more)
-    title, why = _title_and_why(decision, received)
+    requesters = _requesters(decision)
+    title, why, of_operation = _told(decision, requesters, received)
     replaced = "".join(value for key, value in more if key == REPLACES)
+    not_held = [f"  {item}" for item in decision.changes.not_held]
+    warnings = [f"  {warning}" for warning in decision.warnings]
     paragraphs = [
         [one_line(title, _MAX_SUBJECT)],
         [f"Changed: replaces {replaced}; no approval of that counts here."] if replaced else [],
         [f"Why: {why}"],
         _desired_state(decision.releases) if decision.releases or claims else [_UNCHANGED],
-        _list("Listed in the request, but not held by the requester:", decision.changes.not_held),
-        _list("Warnings:", decision.warnings),
+        ["Listed in the request, but not held by the requester:", *not_held] if not_held else [],
+        ["Warnings:", *warnings] if warnings else [],
     ]
     keys = [change.key for change in claims]
     demands = dict.fromkeys((*(key.demand for key in keys), *decision.changes.waiting))
@@ -162,21 +172,16 @@ def of_decision(
         ("Operation", request.operation),
         ("Operation-Id", operation),
         *more,
-        *_operation_trailers(decision),
+        *of_operation,
         *(("Demand-Id", demand) for demand in demands),
-        *(("Requester", requester) for requester in _requesters(decision)),
+        *(("Requester", requester) for requester in requesters),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
         *(("Connection", s.id) for s in subjects if s.kind is SubjectKind.CONNECTION),
         ("Request-Id", request.id),
-        *override_trailers([*decision.overrides, *keep_override_paths(keys)]),
+        *override_trailers(decision.overrides, keys),
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return compose(paragraphs, trailers)
-
-
-def _list(head: str, items: Iterable[object]) -> list[str]:
-    lines = [f"  {item}" for item in items]
-    return [head, *lines] if lines else []
 
 
 def time_text(at: datetime) -> str:
@@ -202,47 +207,47 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
     return tuple(sorted({who for claim in claims if claim for who in claim.requesters}))
 
 
-def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
+def _told(
+    decision: Decision, requesters: tuple[str, ...], received: datetime
+) -> tuple[str, str, list[tuple[str, str]]]:
+    # the title, the reason, and the trailers of this operation
     request, changes = decision.request, decision.changes.claims
     kinds = Counter(subject.kind for subject in decision.changes.subjects())
     counts = [(kinds[kind], kind.value[:-1]) for kind in SubjectKind if kinds[kind]]
     what = " and ".join(f"{count} {kind}{'s' if count > 1 else ''}" for count, kind in counts)
-    what_of_whom = f"{what} in the name of {', '.join(_requesters(decision))}"
+    what_of_whom = f"{what} in the name of {', '.join(requesters)}"
     subjects = ", ".join(subject.id for subject in decision.changes.subjects())
     time = time_text(received)
     if isinstance(request, Restoration):
         to = request.to[:12]
-        return f"Roll back to {to}", (
-            f"{request.by} rolled the ledger back to commit {to}, which changes {what}: "
-            f"{request.reason}"
-        )
+        why = f"{request.by} rolled the ledger back to commit {to}, which changes {what}: "
+        trailers = [("Restores", request.to), ("Reason", request.reason)]
+        return f"Roll back to {to}", why + request.reason, trailers
     if request.operation == "expire":
         claims = [change.before for change in changes]
         last = max(claim.lease.expires_at for claim in claims if claim and claim.lease)
-        return f"Expire {subjects}", (
-            f"the lease of demand '{request.demand}' on {what_of_whom} ended at "
-            f"{time_text(last)} and was not renewed."
-        )
+        why = f"the lease of demand '{request.demand}' on {what_of_whom} ended at "
+        return f"Expire {subjects}", f"{why}{time_text(last)} and was not renewed.", []
     if isinstance(request, Drain):
         moved = "".join(f" {text[0].upper()}{text[1:]}." for text in request.moved)
-        return f"Drain {request.id}", f"'{request.id}' is drained in the inventory.{moved}"
+        why = f"'{request.id}' is drained in the inventory.{moved}"
+        return f"Drain {request.id}", why, [("Node", request.id)]
     if isinstance(request, Decommission):
         by = f" by {request.by}" if request.by else ""
         reason = f" ({request.reason})" if request.reason else ""
         held = f"it held a part of {what_of_whom}" if changes else "its demands waited for room"
-        return f"Decommission {request.id}", (
-            f"'{request.id}' was decommissioned{by} on {time}{reason}; {held}."
-        )
+        why = f"'{request.id}' was decommissioned{by} on {time}{reason}; {held}."
+        nodes, claims = request.nodes or (request.id,), [change.before for change in changes]
+        needed = any(claim.held.needs(node) for claim in claims if claim for node in nodes)
+        trailers = [("Node", request.id)] if needed and "node" in request.kinds else []
+        return f"Decommission {request.id}", why, [*trailers, ("Reason", request.reason)]
     if isinstance(request, Wait):
         who, reasons = ", ".join(request.requesters()), "; ".join(request.reasons)
-        return f"Let {request.demand} wait", (
-            f"request '{request.id}' of demand '{request.demand}' in the name of {who}, received "
-            f"{time}, waits for room: {reasons}."
-        )
+        why = f"request '{request.id}' of demand '{request.demand}' in the name of {who}, received "
+        return f"Let {request.demand} wait", f"{why}{time}, waits for room: {reasons}.", []
     if not changes:
-        return f"Release {', '.join(decision.changes.waiting)}", (
-            f"request '{request.id}', received {time}, releases demands that waited for room."
-        )
+        why = f"request '{request.id}', received {time}, releases demands that waited for room."
+        return f"Release {', '.join(decision.changes.waiting)}", why, []
     only_leases = all(
         change.before and change.after and change.before.booked == change.after.booked
         for change in changes
@@ -253,22 +258,7 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
     why = f"request '{request.id}'{named}, received {time}, {verb} {what_of_whom}."
     placed = "".join(f" {text[0].upper()}{text[1:]}." for text in decision.placed)
     placed += " It waited for room." if request.demand in decision.changes.waiting else ""
-    return f"{title} {subjects}", why + placed
-
-
-def _operation_trailers(decision: Decision) -> list[tuple[str, str]]:
-    request = decision.request
-    if isinstance(request, Restoration):
-        return [("Restores", request.to), ("Reason", request.reason)]
-    if isinstance(request, Drain):
-        return [("Node", request.id)]
-    if not isinstance(request, Decommission):
-        return []
-    reason = [("Reason", request.reason)]
-    claims = [change.before for change in decision.changes.claims]
-    nodes = request.nodes or (request.id,)
-    needed = any(claim.held.needs(node) for claim in claims if claim for node in nodes)
-    return ([("Node", request.id)] if needed and "node" in request.kinds else []) + reason
+    return f"{title} {subjects}", why + placed, []
 
 
 def of_follow(
@@ -293,7 +283,9 @@ def of_follow(
         [title],
         [f"Why: commits up to {cause[:12]} changed configuration, ledger or generated files."],
         _desired_state(releases) if releases else [],
-        _list("Not applied, because not valid:", problems),
+        ["Not applied, because not valid:", *(f"  {each}" for each in problems)]
+        if problems
+        else [],
     ]
     trailers = [
         ("Operation", "follow"),
@@ -320,7 +312,7 @@ def of_override_end(
     ]
     trailers = [
         ("Operation", "expire-override"),
-        *override_trailers([override.path, *keep_override_paths(keys)]),
+        *override_trailers([override.path], keys),
         *demand_trailers(keys),
         *more,
         ("Render-Version", str(RENDER_VERSION)),
@@ -328,13 +320,11 @@ def of_override_end(
     return compose(paragraphs, trailers)
 
 
-def override_trailers(paths: Iterable[str]) -> list[tuple[str, str]]:
-    return [("Override", path) for path in sorted(set(paths))]
-
-
-def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
+def override_trailers(paths: Iterable[str], keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
+    # ``keys`` are those of changed claims, among them those of ``keep`` overrides
     demands = (key.demand for key in keys if key.demand.startswith(OVERRIDE_PREFIX))
-    return [f"{OVERRIDES_ROOT}/{demand.removeprefix(OVERRIDE_PREFIX)}.yaml" for demand in demands]
+    keeping = (f"{OVERRIDES_ROOT}/{name.removeprefix(OVERRIDE_PREFIX)}.yaml" for name in demands)
+    return [("Override", path) for path in sorted({*paths, *keeping})]
 
 
 def demand_trailers(keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:

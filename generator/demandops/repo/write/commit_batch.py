@@ -33,9 +33,9 @@ from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
-from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
+from demandops.repo.load import last_valid_config, ledger_files
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Advance, Snapshot
-from demandops.repo.write.journal import ProposalRecord
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02
@@ -73,15 +73,9 @@ class CommitBatch:
         operation: str,
         received: datetime,
         now: datetime,
-        proposal: ProposalRecord | None = None,
+        more: commit_message.Trailers = (),
     ) -> str:
-        more = [*self._settled, *state_in_effect.trailers_of(self.head)]
-        if proposal:
-            more += [
-                (commit_message.PROPOSAL, proposal.branch),
-                (commit_message.REPLACES, proposal.replaces),
-                *((commit_message.REQUIRED_BY, reason) for reason in decision.approval),
-            ]
+        more = [*self._settled, *snapshots.trailers_of(self.head), *more]
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
         self.frees = self.frees or decision.frees
@@ -144,8 +138,8 @@ class CommitBatch:
         overrides = [
             *relocation.changed_override_files(before.state, state),
             *change.overrides,
-            *commit_message.keep_override_paths(keys),
         ]
+        of_overrides = commit_message.override_trailers(overrides, keys)
         causes = commit_log.person_commits_since(self._objects, before.last_valid_commit, tip)
         text = commit_message.of_follow(
             change.releases,
@@ -153,20 +147,20 @@ class CommitBatch:
             str(before.commit),
             problems,
             [
-                *commit_message.override_trailers(overrides),
+                *of_overrides,
                 *commit_message.demand_trailers(keys),
                 *commit_log.caused_by_trailers(causes),
-                *state_in_effect.trailers_of(self.head),
+                *snapshots.trailers_of(self.head),
             ],
             reports=report != reported,
         )
         author = commit_log.follow_author(causes, now)
         self.commit_files(files, state, text, author, now)
         title = text.partition("\n")[0]
-        self.followed = one_line(", ".join([title, *sorted(set(overrides))]))
+        self.followed = one_line(", ".join([title, *(path for _, path in of_overrides)]))
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
-        judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
+        judgement = snapshots.judge(self._objects, advance, before, self._tree)
         accepted, change = judgement.with_new_config(), None
         if advance.config_changed:
             try:
@@ -204,7 +198,7 @@ class CommitBatch:
         applied = relocation.end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
-        more = state_in_effect.trailers_of(self.head)
+        more = snapshots.trailers_of(self.head)
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
 
@@ -219,7 +213,7 @@ class CommitBatch:
             by_people = (change.entry for change in changes if not change.entry.by_generator)
             causes = [trees.commit_of(self._objects, e.commit) for e in islice(by_people, 1)]
             caused_by = commit_log.caused_by_trailers(causes)
-            more = [*caused_by, *state_in_effect.trailers_of(self.head)]
+            more = [*caused_by, *snapshots.trailers_of(self.head)]
             text = commit_message.of_decision(decision, operation, now, more)
             author = commit_log.follow_author(causes, now)
             self.commit_files(decision.files, decision.state, text, author, now)

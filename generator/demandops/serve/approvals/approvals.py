@@ -27,7 +27,7 @@ from demandops.model.demand.demand import Demand
 from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.git.repository import PushDenied, StateRepository
 from demandops.repo.git.signing import SigningFailed
-from demandops.repo.history import commit_log
+from demandops.repo.history import commit_log, commit_message
 from demandops.repo.history.commit_log import RecordedOutcome
 from demandops.repo.load import ledger_files
 from demandops.repo.load.snapshot import Snapshot
@@ -358,7 +358,12 @@ class Approvals:
         now, branch = self._runtime.now(), old.branch
         for ticket, step in steps:
             if step.files:
-                commits.commit(step, ticket.operation, ticket.received, now, old)
+                more = [
+                    (commit_message.PROPOSAL, old.branch),
+                    (commit_message.REPLACES, old.replaces),
+                    *((commit_message.REQUIRED_BY, reason) for reason in step.approval),
+                ]
+                commits.commit(step, ticket.operation, ticket.received, now, more)
         commit = commits.head.commit
         # Journal both commits before the push: after a crash either may be the branch's head, and
         # a head that is not known here would be taken for a person's.
