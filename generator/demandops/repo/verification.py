@@ -26,7 +26,7 @@ from demandops.model.ledger import records
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 from demandops.model.ledger.ledger import ClaimChange, World
 from demandops.model.release import Release
-from demandops.render import manifests, release_file
+from demandops.render import gitops
 from demandops.render.gitops import path_of
 from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
@@ -144,7 +144,7 @@ class _Proof:
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         # with an override that sets ``hold``: such a file's text depends on the parent commit
         self._held: dict[ReleaseKey, Release] = {}
-        base_files = manifests.base_files(state.config)
+        base_files = gitops.base_files(state.config)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
         self._committed = _generated_files(commit.tree)
         self._render(())
@@ -188,9 +188,7 @@ class _Proof:
     def _rendered(self, release: Release, before: Tree | None) -> tuple[str, Oid]:
         path, state = path_of(release), self.state
         current = trees.read_text(before, path)
-        return path, _blob(
-            release_file.release_text(release, state.config, state.evaluate, current)
-        )
+        return path, _blob(gitops.release_text(release, state.config, state.evaluate, current))
 
     def differing(self) -> tuple[str, ...]:
         wanted = self._undemanded | dict(self._planned.values())
@@ -201,7 +199,7 @@ class _Proof:
                 for path, blob in trees.blobs(before, GENERATED_ROOTS)
                 if "/_charts/" in path and path not in wanted
             }
-            kept = release_file.kept_charts({}, charts, self.state)
+            kept = gitops.kept_charts({}, charts, self.state)
             wanted |= {path: _blob(text) for path, text in kept.items()}
         return _differing(wanted, self._committed)
 
