@@ -11,7 +11,7 @@ from contextlib import suppress
 from datetime import datetime, timedelta
 from math import inf
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from demandops.base.errors import Fault, InvalidInput, OverBudget, OverLimit, fault
 from demandops.base.quoting import quoted
@@ -98,6 +98,8 @@ class Agenda:
     def seconds_until_due(self, state: State, main: str) -> dict[What, float]:
         # ``main`` is empty if no proposal awaits approval
         now, clock = self._runtime.monotonic(), self._runtime.now()
+        if now < self._rest_until:
+            return dict.fromkeys(get_args(What), self._rest_until - now)
         due = now + LONGEST_WAIT_S
         ends = [max(end, self._retry_at.get((name, end), end)) for end, name in _ends(state)]
         if ends:
@@ -114,9 +116,9 @@ class Agenda:
             check = min(check, self._check_new_main_at)
         return {
             "leases": self.leases.seconds_until_due(state.ledger, LONGEST_WAIT_S),
-            "own work": max(due, self._postponed_until) - now,
-            "fetch": fetch - now,
-            "check": check - now,
+            "own work": max(due, self._postponed_until, now) - now,
+            "fetch": max(fetch, now) - now,
+            "check": max(check, now) - now,
         }
 
     # ---- own work ----
@@ -420,9 +422,9 @@ LONGEST_EVALUATION_S = 0.25
 class Backoff:
     def __init__(self, limit: int, runtime: Runtime) -> None:
         self._limit, self._runtime = limit, runtime
-        self.published()
+        self.begin_anew()
 
-    def published(self) -> None:
+    def begin_anew(self) -> None:
         self.max_demands = self._limit
         self._turn = self._away = FIRST_PAUSE_S
 

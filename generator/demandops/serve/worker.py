@@ -138,6 +138,7 @@ class Worker:
         self._agenda = Agenda(fetch_interval, self._runtime, local=repository.always_current)
         self._ahead = ReadAhead()
         self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
+        self._backoff = Backoff(self._batch_limit, self._runtime)
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
         self._logged: list[errors.Fault] = []
@@ -164,15 +165,10 @@ class Worker:
             # people may have decided about proposals before the start: answer these demands first
             if self._demands.proposed:
                 self._work()
-            while self._demands.wait(self._pause()):
+            while self._demands.wait(min(self._due_in().values())):
                 self._heartbeat()
                 self._work()
         self._approvals.suspend()
-
-    def _pause(self) -> float:
-        # until a demand arrives or something on the agenda is due
-        seconds = self._agenda.rest_left_s or min(self._due_in().values())
-        return max(seconds, 0.0)
 
     def _due_in(self) -> dict[What, float]:
         main = str(self.snapshot.commit) if self._approvals.proposals else ""
@@ -232,12 +228,12 @@ class Worker:
         # also the demands that arrive during retries, and the ends of leases; the batch is empty
         # afterwards, unless an error is raised
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
-        backoff = Backoff(self._batch_limit, self._runtime)
+        self._backoff.begin_anew()
         while batch or self._ended_leases(self.snapshot):
             self._heartbeat()
             self._require_not_ending()
             try:
-                wait = self._attempt(batch, backoff)
+                wait = self._attempt(batch)
             except Exception as failure:
                 reason = access_error(failure, self._repository.address, self._repository.objects)
                 if isinstance(reason, PushDenied):
@@ -249,7 +245,7 @@ class Worker:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
                 self._record_unreachable(reason)
                 self._tip_is_fresh = self._repository.always_current
-                wait = backoff.unreachable()
+                wait = self._backoff.unreachable()
             if wait is None:
                 continue
             # Wait before the fetch, not after it, because the push must follow the fetch closely.
@@ -274,7 +270,7 @@ class Worker:
                 f"{reason}; the demand stays in the journal and is resumed at the next start"
             )
 
-    def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:  # noqa: PLR0912
+    def _attempt(self, batch: list[Ticket]) -> float | None:  # noqa: PLR0912
         # the seconds to wait before the next attempt, or None to continue at once
         # fetch before a demand is committed, because after that it can no longer be withdrawn
         if self._must_fetch or self.remote.status.unreachable:
@@ -286,7 +282,7 @@ class Worker:
         published = {ticket for ticket, _ in results}
         independent = len(results)
         left = [ticket for ticket in batch if ticket not in published]
-        part, left = left[: backoff.max_demands], left[backoff.max_demands :]
+        part, left = left[: self._backoff.max_demands], left[self._backoff.max_demands :]
         if self._approvals.proposals:
             self._approvals.remove_released(part, self.snapshot.state)
         commits = self._new_commit_batch()
@@ -308,7 +304,7 @@ class Worker:
                 independent = len(results)
         # leases end last, because a demand that is still left may renew one
         if not left:
-            for ticket in self._ended_leases(commits.head)[: backoff.max_demands - len(part)]:
+            for ticket in self._ended_leases(commits.head)[: self._backoff.max_demands - len(part)]:
                 results.append(self._evaluate(commits, ticket))
                 if self._runtime.monotonic() - began > LONGEST_EVALUATION_S:
                     break
@@ -321,13 +317,13 @@ class Worker:
         if self._publish_commits(commits, results, independent):
             batch[:] = left
             self._demands.put_back(batch, [ticket for ticket, _ in results])
-            backoff.published()
+            self._backoff.begin_anew()
             return None
         log.info("another writer was first; evaluating %d demands again", len(results))
         for ticket in part:
             ticket.mark_maybe_published(str(commits.start.commit))
         self._must_fetch = True
-        return backoff.overtaken(
+        return self._backoff.overtaken(
             len(results), evaluated - began, self._runtime.monotonic() - evaluated
         )
 
@@ -480,9 +476,9 @@ class Worker:
 
     def _follow(self) -> None:
         due_in = self._due_in()
-        is_due = due_in["own work"] <= 0
+        is_due = due_in["own work"] == 0
         try:
-            if due_in["fetch"] <= 0:
+            if due_in["fetch"] == 0:
                 self._agenda.fetch_begins()
                 # a demand that arrives ends the fetch, because its push finds new commits too
                 self._repository.refresh(

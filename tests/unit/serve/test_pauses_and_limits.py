@@ -51,7 +51,7 @@ def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew()
     assert pace.unreachable() <= FIRST_PAUSE_S
     for _ in range(10):
         pace.overtaken(10, 0.1, 1.0)
-    pace.published()
+    pace.begin_anew()
     assert pace.overtaken(10, 0.1, 1.0) <= FIRST_PAUSE_S
 
 
@@ -61,7 +61,7 @@ def test_a_batch_takes_no_more_demands_than_are_evaluated_during_one_push() -> N
     for demands, evaluating_s, most in ((100, 0.1, 100), (100, 1.0, 20), (2, 100.0, 1), (1, 0, 1)):
         pace.overtaken(demands, evaluating_s=evaluating_s, pushing_s=0.2)
         assert pace.max_demands == most
-    pace.published()
+    pace.begin_anew()
     assert pace.max_demands == 200
 
 

@@ -85,14 +85,6 @@ def parse(message: str) -> MessageText:
     return MessageText(lines[0], next(whys, ""), trailers)
 
 
-def _encoded(key: str, value: str) -> str:
-    is_plain = is_visible(value) and value == value.strip() and not _QUOTED.fullmatch(value)
-    if is_plain and (key in _AS_WRITTEN or harmless(value) == value):
-        return value
-    text = escaped(value.replace("\\", r"\\").replace('"', r"\""))
-    return f'"{_EDGES.sub(_SPACE, harmless(text))}"'
-
-
 # The trailer that names the branch on which a commit was proposed for approval.
 PROPOSAL = "Proposal"
 # The trailer with the branch and commit where the demand was proposed with other content.
