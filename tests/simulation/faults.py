@@ -33,7 +33,7 @@ from demandops.repo.load import snapshot
 from demandops.repo.write import journal
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.proposal_branch import ProposalBranches
-from demandops.serve import agenda, demands, generator
+from demandops.serve import agenda, demands
 from demandops.serve.agenda import Draining, LeaseExpiry, WaitingTurns
 from demandops.serve.approvals.approvals import Approvals
 from demandops.serve.demands import Demands, Receipt, Ticket
@@ -99,16 +99,14 @@ def in_reverse(right: Wrong, *given: Any) -> Any:
 
 
 plant("let_strangers_change_a_demand", 1, permission, "stranger_faults", lambda *_: ())
-plant("release_only_the_first_claim", 17, booking, "claims_of", first_only)
+plant("release_only_the_first_claim", 47, booking, "claims_of", first_only)
 plant("replace_what_was_joined", 2, Claim, "extending", itself)
 plant("commit_what_is_booked_already", 15, Claim, "after_booking", itself)
 plant("grant_one_claim_too_many", 4, quotas, "_held", lambda held, *given: held(*given) - 1)
 
 
 @wrong(16, booking, "shut_down")
-def let_a_shutdown_take_from_any_join_of_its_request(
-    shut_down: Any, ledger: Any, asked: Any
-) -> Any:
+def let_a_shutdown_end_any_join_of_its_request(shut_down: Any, ledger: Any, asked: Any) -> Any:
     """Find a claim by the request id and one of the requesters."""
     made = []
     for item in asked.demanded:
@@ -126,7 +124,7 @@ def take_one_common_requester_for_the_owner(
     return () if owners & {*request.requesters()} else faults(request, owners, *more)
 
 
-@wrong(16, Claim, "without_topics")
+@wrong(0, Claim, "without_topics")
 def end_the_whole_claim_by_a_shutdown_of_some_topics(_: Any, claim: Any, gone: Any) -> None:
     return None
 
@@ -176,7 +174,7 @@ def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: An
 plant("take_the_first_domain", 1, Config, "nodes_of", lambda _, config, node: (node,))
 
 
-@wrong(100, completing, "_chosen")
+@wrong(22, completing, "_chosen")
 def forget_what_is_booked_in_a_domain(chosen: Any, one: Any, booked: Any, *more: Any) -> Any:
     return chosen(one, {}, *more)
 
@@ -380,7 +378,7 @@ plant("resume_in_reverse", 1, journal, "read", lambda read, path: dict([*read(pa
 plant("skip_the_search_for_operations", 22, Worker, "_published_before", lambda *_: [])
 
 
-@wrong(30, generator.snapshots, "first_snapshot")
+@wrong(30, snapshot, "first_snapshot")
 def start_without_overrides(first: Any, *given: Any) -> Any:
     found = first(*given)
     config = replace(found.state.config, overrides={})
