@@ -122,18 +122,12 @@ class NewObjects(pygit2.OdbBackend):
         super().__init__()
         # a strong reference would leak the repository and this object: Python does not know that
         # libgit2 refers to this object, so it could not free the cycle
-        self._repo = weakref.ref(repo)
+        self._repo: Repository = weakref.proxy(repo)
         self._packs = Path(repo.path) / "objects" / "pack"
         self._unpacked: dict[Oid, tuple[ObjectType, bytes]] = {}
         self._folders: dict[Oid, Entries] = {}
         # the lowest priority, because most objects are read from the disk
         repo.odb.add_backend(self, 0)
-
-    @property
-    def repo(self) -> Repository:
-        repo = self._repo()
-        assert repo is not None  # noqa: S101 - its writer has a strong reference
-        return repo
 
     def add(self, kind: ObjectType, data: bytes) -> Oid:
         content = b"%s %d\0%s" % (_TYPES[kind], len(data), data)
@@ -149,7 +143,7 @@ class NewObjects(pygit2.OdbBackend):
         tree: Oid,
         parents: Sequence[Oid],
     ) -> Oid:
-        content = str(self.repo.create_commit_string(*people, text, tree, list(parents)))
+        content = str(self._repo.create_commit_string(*people, text, tree, list(parents)))
         if signer is not None:
             head, end, message = content.partition("\n\n")
             # in a commit's header, a line that begins with a space continues the line before
@@ -174,7 +168,7 @@ class NewObjects(pygit2.OdbBackend):
         elif base in self._folders:
             entries = self._folders.pop(base)
         else:
-            raw = self.repo[base].peel(Tree).read_raw()
+            raw = self._repo[base].peel(Tree).read_raw()
             entries = {
                 name + b"/" if mode == _FOLDER else name: entry
                 for entry, mode, name in _ENTRY.findall(raw)
@@ -237,7 +231,7 @@ class NewObjects(pygit2.OdbBackend):
             needed[oid] = None
             kind, data = self._unpacked[oid]
             if kind is ObjectType.COMMIT:
-                parsed = self.repo[oid].peel(pygit2.Commit)
+                parsed = self._repo[oid].peel(pygit2.Commit)
                 queue += [parsed.tree_id, *parsed.parent_ids]
             elif kind is ObjectType.TREE:
                 queue += [unpacked[raw] for raw in _ID.findall(data) if raw in unpacked]
@@ -257,14 +251,14 @@ class NewObjects(pygit2.OdbBackend):
         If ``since`` is unknown here, the pack has all objects of ``commit``. The repository has
         them already, but an earlier sync of them may have failed.
         """
-        without = f"^{since}\n" if since and since in self.repo else ""
+        without = f"^{since}\n" if since and since in self._repo else ""
 
         def copy(folder: Path) -> Path:
             done = subprocess.run(
                 # packing each object anew reads and checks it
                 ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
                  "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
-                cwd=self.repo.path,
+                cwd=self._repo.path,
                 input=f"{commit}\n{without}",
                 capture_output=True,
                 text=True,
@@ -316,7 +310,7 @@ class NewObjects(pygit2.OdbBackend):
     def clean(self) -> None:
         # of what killed processes left, unless another process writes a pack now
         with suppress(OSError), _locked(self._packs, fcntl.LOCK_EX | fcntl.LOCK_NB):
-            for folder in Path(self.repo.path).glob(f"{UNFINISHED}*"):
+            for folder in Path(self._repo.path).glob(f"{UNFINISHED}*"):
                 shutil.rmtree(folder, ignore_errors=True)
             for keep in self._packs.glob("*.keep"):
                 with keep.open("rb") as file:  # a person's .keep does not begin like an index
