@@ -95,20 +95,16 @@ def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fa
         return
     for claim in ledger.connection_claims(held.id):
         for name, new, current in (
-            ("type", str(held.type), str(claim.connection.type)),
             ("source", held.source, claim.connection.source),
             ("target", held.target, claim.connection.target),
-            ("broker", held.broker, claim.connection.broker),
         ):
-            # a broker that only one of the two names is no contradiction
-            if new == current or (name == "broker" and not (new and current)):
-                continue
-            message = (
-                f"'{new}' {_contradicts(above)}: {_held(claim, above)} with {name} '{current}'; "
-                f"use the same {name}, or another connection id"
-            )
-            yield item.fault(name, message, code="conflict")
-            return
+            if new != current:
+                message = (
+                    f"'{new}' {_contradicts(above)}: {_held(claim, above)} with {name} "
+                    f"'{current}'; use the same {name}, or another connection id"
+                )
+                yield item.fault(name, message, code="conflict")
+                return
         yield from _route_conflicts(item, held, claim, above)
 
 
@@ -148,7 +144,7 @@ def _route_conflicts(
         for name, old, new in routes.contradictions(current, route):
             message = (
                 f"{name} {new} of '{route.source}' {_contradicts(above)}: {held} with "
-                f"{name} {old}; use the same {name}, or a second connection"
+                f"{name} {old}; use the same {name}"
             )
             yield item.fault(f"{where}.{name}", message, code="conflict")
 
@@ -250,21 +246,19 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
     taken, not_held = dict[ClaimKey, set[TopicKey]](), list[str]()
     for item in request.demanded:
         subject, who = item.held.subject, ", ".join(sorted(set(item.requesters)))
-        claim = ledger.get(ClaimKey(subject, demand_id(request.id, item.requesters)))
-        if claim and not (claim.joined and claim.held.matches_listed(item.held)):
-            claim = None
-        listed = [words for words, _ in item.held.listed_topics(item.held)]
-        if claim is None:
-            not_held += [f"{subject}: {words} for {who}" for words in listed]
-            not_held += [] if listed else [f"{subject} for {who}"]
-        elif not listed:
-            taken.setdefault(claim.key, set()).update(claim.held.topic_keys())
-        else:
-            for words, held in claim.held.listed_topics(item.held):
-                if held:
-                    taken.setdefault(claim.key, set()).update(held)
-                else:
-                    not_held.append(f"{subject}: {words} for {who}")
+        mine = [
+            claim
+            for claim in ledger.claims_of_demand(demand_id(request.id, item.requesters))
+            if claim.joined
+        ]
+        listing = _listed_inputs if isinstance(item.held, Application) else _listed_routes
+        for words, keys in listing(item.held, mine):  # type: ignore[arg-type]
+            for key, topics in keys:
+                taken.setdefault(key, set()).update(topics)
+            if not any(topics for _, topics in keys):
+                not_held.append(
+                    f"{subject}: {words} for {who}" if words else f"{subject} for {who}"
+                )
     if not taken:
         similar = [
             f"{claim.subject} for {', '.join(claim.requesters)} ("
@@ -293,6 +287,53 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
         after = after.replace(key, claim and claim.without_topics(topics))
     changes = claim_changes(ledger, after, taken)
     return after, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
+
+
+# (words, claims and their topics) for each topic that a shutdown lists, or for all of the subject
+_Listed = Iterator[tuple[str, list[tuple[ClaimKey, set[TopicKey]]]]]
+
+
+def _listed_inputs(listed: Application, claims: list[Claim]) -> _Listed:
+    claim = next((claim for claim in claims if claim.subject == listed.subject), None)
+    app = claim.application if claim else listed
+    is_held = claim and listed.node in ("", app.node) and listed.appdef == app.appdef
+    for words, keys in app.listed_topics(listed):
+        yield words, [(claim.key, set(keys))] if claim and is_held and keys else []
+    if not any(listed.inputs.values()):
+        yield "", [(claim.key, set(app.topic_keys()))] if claim and is_held else []
+
+
+def _listed_routes(listed: Connection, claims: list[Claim]) -> _Listed:
+    """Find the routes wherever the demand has them; a node that is left out matches any node."""
+    nodes = {*filter(None, listed.nodes)}
+    claims = [c for c in claims if not c.is_on_application and nodes <= {*c.connection.nodes}]
+    for route in listed.topics:
+        keys = list[tuple[ClaimKey, set[TopicKey]]]()
+        for claim in claims:
+            booked = claim.connection.route(route.source)
+            if booked is None or claim.subject != listed.subject:
+                named = (route.read_topic, route.written_topic)
+                booked = next(
+                    (
+                        other
+                        for other in filter(None, map(claim.connection.route, named))
+                        if (other.read_topic, other.written_topic) == named
+                    ),
+                    None,
+                )
+            if booked:
+                keys.append((claim.key, {(booked.source,)}))
+        yield f"topic {route.source}", keys
+    if not listed.topics:
+        keys = []
+        for claim in claims:
+            topics: set[TopicKey] = {
+                (route.source,)
+                for route in claim.connection.topics
+                if not route.implied and (route.listed or claim.subject.id) == listed.id
+            }
+            keys += [(claim.key, topics)] if topics else []
+        yield "", keys
 
 
 def release_demand(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:

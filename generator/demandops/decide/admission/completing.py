@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from demandops.base.errors import Fault
 from demandops.connections.connection import Connection
+from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
 from demandops.decide.placement import placement
@@ -50,10 +51,10 @@ def completed(
 def placed(demand: AnyDemand, state: State) -> AnyDemand:
     """Return a demand, whose nodes are chosen, with all else that the generator adds."""
     config, ledger = state.config, state.ledger
+    demand = carriers.with_implied_routes(demand, ledger, config)
+    # before what depends on the connection: its lease, type, permission, quota and approval
+    demand = carriers.with_carriers(demand, ledger, config)
     demand = permission.with_lease_terms(demand, config)
-    # clients of the reference list their connections, and later shut down just what they listed
-    if not demand.is_reference:
-        demand = flows.with_implied_connections(demand, ledger, config)
     demand = admission.with_chosen_types(demand, config, ledger.connection)
     return replace(demand, is_complete=True)
 

@@ -51,9 +51,14 @@ def denial_faults(request: Demand, after: World, changes: Changes) -> Iterator[F
         )
         for override, selector in islice(matching, 1):
             until = f" until {format_time(override.end)}" if override.end else ""
+            carried = (
+                ""
+                if item.is_listed or isinstance(item.held, Application)
+                else (f"is carried by connection '{item.held.id}', which ")
+            )
             message = (
-                f"is denied by {override.path}{until}: {override.reason}; ask the override's "
-                f"owner, {override.owner}, or demand something else"
+                f"{carried}is denied by {override.path}{until}: {override.reason}; ask the "
+                f"override's owner, {override.owner}, or demand something else"
             )
             yield item.fault(_matched_field(selector, item, after.config), message, code="denied")
 

@@ -20,7 +20,7 @@ from demandops.base.errors import MOST_FAULTS, Fault, Refused, fault, field_path
 from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
-from demandops.connections.connection import Connection, Route
+from demandops.connections.connection import RECORDED, Connection, Route
 from demandops.connections.connection_types import by_number, type_numbered
 from demandops.model.config.base_model import FrozenModel, Items, faults_of, seconds_of
 from demandops.model.config.inventory import Coordinate, Position
@@ -184,6 +184,16 @@ def _applications_read(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault
             faults.append(fault(f"{where}.parameters_json", "must be a mapping of names to JSON"))
         applications.append(read)
     return goal | {"applications": applications}, faults
+
+
+def _recorded_of_topics(goal: dict[str, Any]) -> Iterator[Fault]:
+    connections = goal.get("connections")
+    for index, connection in enumerate(connections if isinstance(connections, list) else ()):
+        topics = connection.get("topics") if isinstance(connection, dict) else ()
+        for place, topic in enumerate(topics if isinstance(topics, list) else ()):
+            for name in sorted(RECORDED & topic.keys() if isinstance(topic, dict) else ()):
+                at = f"connections[{index}].topics[{place}].{name}"
+                yield fault(at, "is recorded by the generator; remove it")
 
 
 # How many levels a parameter's value may have. It is a part of a claim's file, which may have 100.
@@ -365,7 +375,7 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
         demand = _parsed(WireGoal, goal, faults)
     else:
         united, faults = _applications_read(goal)
-        demand = _parsed(DemandGoal, united, faults)
+        demand = _parsed(DemandGoal, united, [*faults, *_recorded_of_topics(goal)])
     return replace(demand, goal=goal)
 
 

@@ -13,7 +13,7 @@ from rpds import HashTrieMap, HashTrieSet
 
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import connection_types
-from demandops.connections.connection import Connection, ConnectionType
+from demandops.connections.connection import Connection, ConnectionType, RouteKey
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override, by_rank, still_active
 from demandops.model.demand.demand import UNSTARTED, Application, InputTopic
@@ -125,6 +125,12 @@ class Ledger:
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         return self._ids("brings", target, topic)
+
+    def claims_bringing(self, target: str, topic: str) -> tuple[Claim, ...]:
+        return self._claims("brings", target, topic)
+
+    def route_holders(self, key: RouteKey) -> Iterable[ClaimKey]:
+        return self.index.get(("route", *key)) or ()
 
     def is_carried_to(self, target: str, topic: str) -> bool:
         return ("brings", target, topic) in self.index
