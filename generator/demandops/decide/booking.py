@@ -93,6 +93,7 @@ def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fa
                 yield item.fault(name, message, code="conflict")
                 return
         return
+    told = set[str]()  # a contradiction with several claims is told once
     for claim in ledger.connection_claims(held.id):
         for name, new, current in (
             ("source", held.source, claim.connection.source),
@@ -105,7 +106,10 @@ def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fa
                 )
                 yield item.fault(name, message, code="conflict")
                 return
-        yield from _route_conflicts(item, held, claim, above)
+        for each in _route_conflicts(item, held, claim, above):
+            if each.field not in told:
+                told.add(each.field)
+                yield each
 
 
 def _contradicts(above: bool) -> str:

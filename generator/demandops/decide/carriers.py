@@ -184,9 +184,6 @@ class _Carriers:
             )
             return
         carrier, current = carried or (listed if listed.id else self._derived(listed, route), None)
-        # a client of the reference did not ask for the connection, so a warning must do
-        if not listed.id and carrier.type is None and not self._is_put:
-            return
         header = self._header(carrier.id)
         if header is None:
             wanted = listed if carrier.id == listed.id else carrier
@@ -297,7 +294,7 @@ def doubled(connection: Connection, ledger: Ledger) -> Iterator[tuple[int, str]]
 
 
 def brought_twice(connection: Connection, ledger: Ledger) -> Iterator[tuple[int, str]]:
-    """Yield (index, words) for each route to a topic that other routes bring to the node too."""
+    """Yield (index, words) for each route to a topic that another route brings to the node too."""
     for index, route in enumerate(connection.topics):
         key = connection.key_of(route)
         for claim in ledger.claims_bringing(key.receiver, key.target):
@@ -311,6 +308,22 @@ def brought_twice(connection: Connection, ledger: Ledger) -> Iterator[tuple[int,
                     f"{quoted(rival.sender)} by connection {quoted(claim.subject.id)}",
                 )
                 break
+
+
+def chosen_twice(
+    connection: Connection, apps: Iterable[Application], ledger: Ledger
+) -> Iterator[tuple[int, str]]:
+    """Yield those of :func:`brought_twice` that follow from a node, and not from a listed input.
+
+    A requester may demand two sources of a topic, but the generator chooses no node because of
+    which there are two.
+    """
+    inputs = {(topic.source, topic.topic) for app in apps for _, topic in app.all_inputs()}
+    for index, words in brought_twice(connection, ledger):
+        route = connection.topics[index]
+        key = connection.key_of(route)
+        if route.implied and (key.sender, key.topic) not in inputs:
+            yield index, words
 
 
 # ---- moves: when an application moves, its routes follow, with type and options ----

@@ -56,7 +56,23 @@ def placed(demand: AnyDemand, state: State) -> AnyDemand:
     demand = carriers.with_carriers(demand, ledger, config)
     demand = permission.with_lease_terms(demand, config)
     demand = admission.with_chosen_types(demand, config, ledger.connection)
+    if demand.operation == "join":
+        demand = _without_impossible_routes(demand, config)
     return replace(demand, is_complete=True)
+
+
+def _without_impossible_routes(demand: AnyDemand, config: Config) -> AnyDemand:
+    # A client of the reference does not ask for the connections that it does not list, and gets a
+    # warning where there can be none.
+    def is_possible(item: Item) -> bool:
+        held = item.held
+        if not isinstance(held, Connection) or not all(route.implied for route in held.topics):
+            return True
+        alone = replace(demand, demanded=(item,))
+        faults = (*admission.faults(alone, config), *permission.faults(alone, config))
+        return not held.topics or not faults
+
+    return replace(demand, demanded=tuple(filter(is_possible, demand.demanded)))
 
 
 # ---- the definition that a goal of the reference's action means by a number ----

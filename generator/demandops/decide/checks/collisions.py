@@ -45,18 +45,16 @@ def topic_faults(
     for key in keys:
         if isinstance(key, ServiceKey) and not is_needed(before, key):
             yield from islice(_clashes_of_service(request, after, key), 1)
+    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
+    chosen = any(app.place or {*app.services} - {*app.named} for app in apps)
     for item in request.demanded:
         connection = item.held
         if isinstance(connection, Application):
             continue
-        # a requester may name a node to which a topic comes twice, but the generator chooses none
-        if any(each.placed for each in request.demanded):
-            for index, words_of_both in carriers.brought_twice(connection, after.ledger):
-                route = connection.topics[index]
-                held = before.ledger.route_holders(connection.key_of(route))
-                if route.implied and not held:
-                    message = f"{words_of_both}; name a node"
-                    yield item.fault(f"topics[{index}]", message, code="conflict")
+        for index, both in carriers.chosen_twice(connection, apps, after.ledger) if chosen else ():
+            if not before.ledger.route_holders(connection.key_of(connection.topics[index])):
+                message = f"{both}; choose another node"
+                yield item.fault(f"topics[{index}]", message, code="conflict")
         for index, route in enumerate(connection.topics):
             _, node = route.sender_and_receiver(*connection.nodes)
             topic = route.written_topic

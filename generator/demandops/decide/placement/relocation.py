@@ -192,12 +192,14 @@ def _moved(
 
 
 def _brought_twice(change: ClaimChange, ledger: Ledger) -> Iterator[Fault]:
-    # a requester may demand a second source of a topic, but the generator adds none by itself
     if change.after is None or change.after.is_on_application:
         return
     former = change.before.connection.topics if change.before else ()
-    for index, words in carriers.brought_twice(change.after.connection, ledger):
-        if change.after.connection.topics[index] not in former:
+    held = ledger.claims_of_demand(change.key.demand)
+    apps = [claim.application for claim in held if claim.is_on_application]
+    connection = change.after.connection
+    for index, words in carriers.chosen_twice(connection, apps, ledger):
+        if connection.topics[index] not in former:
             yield Fault("conflict", "", words)
 
 
