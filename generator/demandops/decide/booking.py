@@ -231,6 +231,11 @@ def put(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes
         key = ClaimKey(item.held.subject, demand)
         if ledger.get(key) is not None:
             message = f"'{key.subject.id}' is listed twice; list it once, with all its topics"
+            if isinstance(item.held, Connection):
+                message = (
+                    f"'{key.subject.id}' is listed between several nodes, or carries another topic "
+                    "of this demand between others; use a second connection id"
+                )
             faults.append(item.fault("id", message))
         ledger = book(ledger, item, request.id, key, start.get(key), now)
         keys.append(key)
