@@ -41,10 +41,21 @@ _CODES: tuple[tuple[type[BaseException], str], ...] = (
 )
 
 
+# The request id of all claims by DeploymentRequests if the node ignores the ids of goals. A claim's
+# file and its commit say so by this text.
+IGNORED_ID = "ignored-id"
+
+
 class DeploymentRequestAdapter:
     # of the reference's action, whose results and feedback are plain text
     action: Any = DeploymentRequest
-    to_data: Callable[[Any], Any] = staticmethod(message_to_data)
+
+    def __init__(self, *, ignores_ids: bool = False) -> None:
+        self._ignores_ids = ignores_ids
+
+    def to_data(self, goal: Any) -> Any:  # noqa: ANN401
+        data = message_to_data(goal)
+        return {**data, "id": IGNORED_ID} if self._ignores_ids else data
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         return str(goal.id)
@@ -61,7 +72,9 @@ class DeploymentRequestAdapter:
 
 class DemandAdapter(DeploymentRequestAdapter):
     action = Demand
-    to_data = staticmethod(demand_goal_to_data)
+
+    def to_data(self, goal: Any) -> Any:  # noqa: ANN401
+        return demand_goal_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         return str(goal.demand_id)

@@ -141,8 +141,11 @@ class DemandNode(Node):  # type: ignore[misc]
         level: Level,
         timeout_s: float,
         status: RolloutWatcher | None,
+        *,
+        ignores_ids: bool,
     ) -> None:
-        # ``level`` is for goals that name none; ``timeout_s`` limits a rollout
+        # ``level`` is for goals that name none; ``timeout_s`` limits a rollout; ``ignores_ids``
+        # concerns DeploymentRequests
         super().__init__("demandops")
         self._generator = generator
         self._level, self._timeout_s, self._status = level, timeout_s, status
@@ -157,7 +160,7 @@ class DemandNode(Node):  # type: ignore[misc]
             self._handle_events, callback_group=MutuallyExclusiveCallbackGroup()
         )
         self._servers = [
-            self._serve(DeploymentRequestAdapter(), action_name),
+            self._serve(DeploymentRequestAdapter(ignores_ids=ignores_ids), action_name),
             self._serve(actions.DemandAdapter(), demand_action_name),
         ]
         self.create_service(

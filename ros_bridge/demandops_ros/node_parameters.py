@@ -118,12 +118,17 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
 # ---- the node's parameters: their defaults, descriptions and ranges ----
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
-_CHOICES = {"answer": ANSWER_LEVELS, "log_level": LOG_LEVELS}
+_CHOICES = {
+    "answer": ANSWER_LEVELS,
+    "deployment_request_ids": ("use", "ignore"),
+    "log_level": LOG_LEVELS,
+}
 DEFAULTS: dict[str, Any] = {
     "action_name": settings.DEFAULT_ACTION_NAME,
     "demand_action_name": settings.DEFAULT_DEMAND_ACTION_NAME,
     "answer": ANSWER_LEVELS[0],
     "answer_timeout": 120.0,
+    "deployment_request_ids": "use",
     "state_repo": "",
     "fetch_interval": DEFAULT_INTERVAL,
     "requester_queue_limit": settings.REQUESTER_QUEUE_LIMIT,
@@ -134,6 +139,8 @@ _DESCRIPTIONS = {
     "demand_action_name": "Name of the action Demand.",
     "answer": "When a DeploymentRequest is answered.",
     "answer_timeout": "How many seconds a goal may take to be reconciled or healthy.",
+    "deployment_request_ids": "Whether the id of a DeploymentRequest tells apart what is demanded; "
+    "ignored, all are booked under one id.",
     "state_repo": "Folder or URL of the state repo.",
     "fetch_interval": "How often people's commits are fetched while no demand comes; 0 means no "
     "fetches at an interval.",

@@ -98,11 +98,12 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
 
     Its actions are DeploymentRequest and Demand. Everything after --ros-args goes to ROS.
     Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
-    DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds), state_repo,
-    fetch_interval, requester_queue_limit (how many demands of one requester may be without an
-    answer), log_level (debug, info, warn, error or fatal). The parameter file of the reference's
-    node works too (docs/migration.md). Stop the node with Ctrl-C or SIGTERM: it publishes queued
-    demands for some seconds, and the journal keeps the others for the next start.
+    DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds),
+    deployment_request_ids (use, or ignore for clients that number their goals; docs/demand.md),
+    state_repo, fetch_interval, requester_queue_limit (how many demands of one requester may be
+    without an answer), log_level (debug, info, warn, error or fatal). The parameter file of the
+    reference's node works too (docs/migration.md). Stop the node with Ctrl-C or SIGTERM: it
+    publishes queued demands for some seconds, and the journal keeps the others for the next start.
 
     \b
     Examples:
@@ -179,6 +180,7 @@ def _run(
         settings["answer"],
         settings["answer_timeout"],
         status,
+        ignores_ids=settings["deployment_request_ids"] == "ignore",
     )
     for name, value in settings.items():
         shown = generator.address if name == "state_repo" else value

@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache, wraps
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -195,6 +195,12 @@ def _is_json(value: Any) -> bool:
         return bool(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError):
         return False
+
+
+def without_field(data: bytes) -> None:
+    text = _text(data)
+    for field in islice(strict_yaml.lines(text), 20):
+        strict_yaml.without_field(text, field)
 
 
 def set_key(data: bytes) -> None:
@@ -432,7 +438,10 @@ TARGETS = (
     Target(config_file, _seeds_of(_FILES)),
     Target(chart_file, _seeds_of(_CHARTS)),
     Target(chart_values, values=_changed_charts()),
-    Target(set_key, tuple(_CONFIG[path].encode() for path in _FILES)),
+    *(
+        Target(one, tuple(_CONFIG[path].encode() for path in _FILES))
+        for one in (set_key, without_field)
+    ),
     Target(claim, _bytes(_BOOKED)),
     *(Target(one, _seeds(one)) for one in (marker, waiting_demand)),
     Target(contexts_file, _seeds(contexts_file)),

@@ -215,7 +215,7 @@ class TestRollback:
         assert (ran.code, played.tip) == (1, before)
 
 
-FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 2\n"
+FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 3\n"
 Changed = dict[str, str | None]
 
 
@@ -271,6 +271,8 @@ class TestVerifyByDifferences:
             ("ledger/connections/00/x-0/y-0.yaml", "join"),
             ("overrides/a", "join"),
             (f"{SHUTDOWNS_ROOT}/x.yaml", "put"),
+            ("appdefs/object-detection-fusion/appdef.yaml", "upgrade"),
+            ("ledger/replicas/00/x.yaml", "upgrade"),
             ("claim", "join"),  # of the demand that the commit names, but with a comment
             ("claim", "follow"),  # of a demand that the commit does not name
         ],

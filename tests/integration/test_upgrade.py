@@ -66,7 +66,7 @@ def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subproce
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
     for path, old, new in (
-        ("generator/demandops/base/settings.py", "RENDER_VERSION = 2\n", "RENDER_VERSION = 3\n"),
+        ("generator/demandops/base/settings.py", "RENDER_VERSION = 3\n", "RENDER_VERSION = 4\n"),
         ("templates/flux/release.yaml.j2", "timeout: 5m", "timeout: 6m"),
     ):
         text = (folder / path).read_text()
@@ -207,12 +207,12 @@ def test_a_newer_program_serves_only_after_an_upgrade_and_the_older_only_before(
     old = state.files()
     ran = newer("upgrade")
     assert (ran.code, ran.err) == (0, "")
-    assert ran.out.endswith(f"render version 2 → 3\nin commit {state.tip}\n")
+    assert ran.out.endswith(f"render version 3 → 4\nin commit {state.tip}\n")
     new = state.files()
     changed = {path for path in new if new[path] != old.get(path)}
     assert {path.rsplit("/", 1)[-1][:3] for path in changed} == {"dem", "od-", "of-"}
-    assert new[ROOT_FILE] == old[ROOT_FILE].replace("renderVersion: 2", "renderVersion: 3")
-    assert "From-Render-Version: 2\nGitops: flux\nRender-Version: 3\n" in state.commits()[0]
+    assert new[ROOT_FILE] == old[ROOT_FILE].replace("renderVersion: 3", "renderVersion: 4")
+    assert "From-Render-Version: 3\nGitops: flux\nRender-Version: 4\n" in state.commits()[0]
     assert all(row["holds"] for row in newer("verify", "--output", "json").json())
     assert "nothing to do" in newer("upgrade").out
 

@@ -66,6 +66,23 @@ def test_the_eight_steps_of_the_paper_give_its_bookkeeping(serve: Serve, client:
     assert git(served.state_repo, "rev-list", "--count", "main") == "9"
 
 
+def test_a_client_that_numbers_its_goals_ends_what_it_joined_if_ids_are_ignored(
+    serve: Serve, client: Client
+) -> None:
+    served = serve(None, "--ros-args", "-p", "deployment_request_ids:=ignore")
+    client.ready()
+    joined, again = (client.call(connection(1) | {"id": f"goal {number}"}) for number in (1, 2))
+    ended, repeated = (
+        client.call(connection(1) | {"id": f"goal {number}", "shutdown": True}) for number in (3, 4)
+    )
+    assert [each.message.split(":")[0] for each in (joined, again, ended, repeated)] == [
+        *("booked", "unchanged", "released", "not-held")
+    ]
+    assert served.bookkeeping()["connections"] == {}
+    assert "goal 'goal 3': released" in served.log.read_text()
+    assert "request 'ignored-id'" in git(served.state_repo, "log", "--format=%B", "main")
+
+
 def test_a_goal_that_cannot_be_honoured_is_aborted_with_code_field_and_remedy(
     shared: Served, caller: Client
 ) -> None:

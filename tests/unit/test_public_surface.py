@@ -110,12 +110,15 @@ def walk(schema: Json, definitions: Json, path: str) -> Iterator[tuple[str, str]
 
 
 def claim_files() -> Json:
-    """Return the top-level fields of the claims in the golden cases, by version and kind."""
+    """Return the fields of the claims in the golden cases, by version and kind."""
     found: dict[str, set[str]] = {}
     steps = (files for case in CASES for files in whole(case).values())
     texts = {text for files in steps for path, text in files.items() if path.startswith("ledger/")}
     for claim in map(yaml.safe_load, texts):
-        found.setdefault(f"{claim['apiVersion']} {claim['kind']}", set()).update(claim)
+        names = found.setdefault(f"{claim['apiVersion']} {claim['kind']}", set())
+        names.update(claim)
+        for held in ("application", "connection"):
+            names.update(f"{held}.{name}" for name in claim.get(held, ()))
     return {kind: " ".join(sorted(names)) for kind, names in sorted(found.items())}
 
 

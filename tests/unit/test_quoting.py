@@ -110,5 +110,5 @@ def test_faults_that_are_passed_on_are_still_counted_right() -> None:
 
 
 def test_a_file_that_is_no_mapping_is_told_the_format_of_its_own_kind() -> None:
-    with pytest.raises(InvalidInput, match=r"starts with apiVersion: demandops\.ledger/v2"):
+    with pytest.raises(InvalidInput, match=r"starts with apiVersion: demandops\.ledger/v3"):
         parse_file(_WaitingFile, "[]", "ledger/waiting/a.yaml")

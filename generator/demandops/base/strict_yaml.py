@@ -377,16 +377,16 @@ def without_field(text: str, field: str) -> str:
     If its form does not permit this, the text is returned unchanged.
     """
     *parents, last = field.split(".")
-    wanted = inner = load(text)
-    node: Any = yaml.compose(text, Loader=yaml.SafeLoader)
     try:
+        wanted = inner = load(text)
+        node: Any = yaml.compose(text, Loader=yaml.SafeLoader)
         for parent in parents:
             inner = inner[parent]
             node = next(value for name, value in node.value if name.value == parent)
         del inner[last]
-    except KeyError:  # a part is no text, like `1`
-        return text
-    key, value = next(pair for pair in node.value if pair[0].value == last)
+        key, value = next(pair for pair in node.value if pair[0].value == last)
+    except (InvalidInput, LookupError, StopIteration, TypeError, ValueError):
+        return text  # it has several documents, or a key that is no text, like `1`
     head, tail = text[: key.start_mark.index], text[value.end_mark.index :]
     if len(node.value) == 1:
         head += "" if node.flow_style else "{}"

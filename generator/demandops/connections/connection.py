@@ -10,12 +10,13 @@ from operator import attrgetter
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 from pydantic import Field, PlainSerializer, PlainValidator, Strict, StrictBool
+from pydantic.json_schema import SkipJsonSchema
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.base.quoting import quoted
-from demandops.model.config.base_model import PART, Items, plain_number, without
+from demandops.model.config.base_model import PART, RECORDED, Items, plain_number, without
 from demandops.model.config.config import CLIENTS_FILE, Config, ConfigReader
 from demandops.model.config.inventory import Node
 from demandops.model.config.override import UNSHAPED, Shaping, patched_settings
@@ -57,8 +58,8 @@ class Route:
     rate: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False), plain_number] = 0.0
     # What the generator records in a claim: an application of the demand needs the route, and no
     # goal lists it; or the goal lists it under this id, and the claim's connection carries it.
-    implied: StrictBool = False
-    listed: str = ""
+    implied: Annotated[StrictBool, RECORDED, SkipJsonSchema()] = False
+    listed: Annotated[str, RECORDED, SkipJsonSchema()] = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source", naming.absolute_topic(self.source))
@@ -89,13 +90,10 @@ class Route:
         return (target, source) if self.reverse else (source, target)
 
 
-# What only claims record of a route
-RECORDED = frozenset(("implied", "listed"))
-
 _DEFAULTS = tuple(
     (item.name, item.default)
     for item in fields(Route)
-    if item.name not in ("source", "target", *RECORDED)
+    if item.name not in ("source", "target", "implied", "listed")
 )
 
 
@@ -192,20 +190,17 @@ def _type_field() -> PlainValidator:
 
 @dataclass(frozen=True, slots=True)
 class Connection:
-    """One connection and the topics that it carries.
-
-    The connection of a claim has a type, and its routes are sorted by source topic, without
-    duplicates (:meth:`booked`).
-    """
+    """One connection and the topics that it carries."""
 
     __pydantic_config__: ClassVar = PART
 
     id: str = ""
-    # None if a demand leaves it open
+    # None if a demand leaves it open; that of a claim is not None
     type: Annotated[
         ConnectionType | None,
         _type_field(),
         PlainSerializer(lambda kind: kind.word, when_used="unless-none"),
+        Field(json_schema_extra={"default": "auto"}),
     ] = None
     source: str = ""
     target: str = ""

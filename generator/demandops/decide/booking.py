@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 
 from demandops.base.errors import Fault, Refused, fault, suggestion
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections import connection as routes
-from demandops.connections.connection import Connection
+from demandops.connections.connection import Connection, Route
 from demandops.decide.rollback import Restoration, restore
 from demandops.model.demand.demand import (
     Application,
@@ -24,22 +24,9 @@ from demandops.model.ledger.claim import Claim, ClaimKey, demand_id, requesters_
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
 from demandops.model.ledger.records import Wait
 
-# ---- owners: the requesters for whom a demand that has an id holds claims or waits ----
-#
-# A request is refused if it names none of the owners. So if a second requester chooses the same
-# demand id by chance, its requests cannot change the demand of the first requester.
 
-
-def is_waiting(ledger: Ledger, request: Demand) -> bool:
-    """Return whether the request's demand waits; raise Refused if it is of others."""
-    waiting = ledger.waiting.get(request.demand)
-    if waiting is not None:
-        refuse_other_owners(waiting.requesters, request)
-    return waiting is not None
-
-
-def owned_claims(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
-    """Return the claims of the demand; raise Refused if it holds none or is of others."""
+def claims_of(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
+    """Return the claims of the request's demand; raise Refused if it holds none."""
     held = ledger.claims_of_demand(request.demand)
     if not held:
         demands = sorted(
@@ -55,17 +42,7 @@ def owned_claims(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
             hint = f"the requesters of this request hold, for example, {', '.join(demands[:5])}"
         message = f"'{request.demand}' holds nothing; {hint}"
         raise Refused.at("demand", message, code="not-held")
-    refuse_other_owners(requesters_of(held), request)
     return held
-
-
-def refuse_other_owners(owners: Sequence[str], request: Demand) -> None:
-    if owners and not set(owners) & set(request.requesters()):
-        message = (
-            f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; name one of them, or "
-            "choose another demand id"
-        )
-        raise Refused.at("demand", message, code="not-yours")
 
 
 # ---- conflicts: a demand contradicts existing claims on the same application or connection ----
@@ -220,8 +197,7 @@ def put(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes
     # After a put, a demand with an id holds exactly what the put lists.
     start, demand = ledger, request.demand
     held = ledger.claims_of_demand(demand)
-    refuse_other_owners(requesters_of(held), request)
-    waited = (demand,) * is_waiting(ledger, request)
+    waited = (demand,) * (demand in ledger.waiting)
     # the demand's own claims are no contradiction, because a put may move its own applications
     ledger = others = ledger.without(held)
     faults: list[Fault] = []
@@ -261,10 +237,10 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
             if claim.joined
         ]
         listing = _listed_inputs if isinstance(item.held, Application) else _listed_routes
-        for words, keys in listing(item.held, mine):  # type: ignore[arg-type]
-            for key, topics in keys:
+        for words, held in listing(item.held, mine):  # type: ignore[arg-type]
+            for key, topics in held:
                 taken.setdefault(key, set()).update(topics)
-            if not any(topics for _, topics in keys):
+            if not held:
                 not_held.append(
                     f"{subject}: {words} for {who}" if words else f"{subject} for {who}"
                 )
@@ -285,8 +261,8 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
         ]
         shown = "; ".join(dict.fromkeys(similar[:5])) or "none"
         message = (
-            f"nothing that the shutdown lists is held by the request '{request.id}' of these "
-            f"requesters; similar claims: {shown}"
+            f"nothing that the shutdown lists is held by a join with the id '{request.id}' and the "
+            f"same requesters; similar claims: {shown}"
         )
         place = request.demanded[0].fault if request.demanded else fault
         raise Refused([place("id", message, code="not-held")])
@@ -298,56 +274,61 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
     return after, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
 
 
-# (words, claims and their topics) for each topic that a shutdown lists, or for all of the subject
+# (words, claims and their topics) for each topic that a shutdown lists; no words: for the subject
 _Listed = Iterator[tuple[str, list[tuple[ClaimKey, set[TopicKey]]]]]
 
 
 def _listed_inputs(listed: Application, claims: list[Claim]) -> _Listed:
     claim = next((claim for claim in claims if claim.subject == listed.subject), None)
     app = claim.application if claim else listed
-    is_held = claim and listed.node in ("", app.node) and listed.appdef == app.appdef
-    for words, keys in app.listed_topics(listed):
-        yield words, [(claim.key, set(keys))] if claim and is_held and keys else []
-    if not any(listed.inputs.values()):
-        yield "", [(claim.key, set(app.topic_keys()))] if claim and is_held else []
+    if claim is None or listed.node not in ("", app.node) or listed.appdef != app.appdef:
+        yield "", []
+    elif any(listed.inputs.values()):
+        for words, keys in app.listed_topics(listed):
+            yield words, [(claim.key, set(keys))] if keys else []
+    else:
+        yield "", [(claim.key, set(app.topic_keys()))]
 
 
 def _listed_routes(listed: Connection, claims: list[Claim]) -> _Listed:
     """Find the routes wherever the demand has them; a node that is left out matches any node."""
     nodes = {*filter(None, listed.nodes)}
     claims = [c for c in claims if not c.is_on_application and nodes <= {*c.connection.nodes}]
-    for route in listed.topics:
-        keys = list[tuple[ClaimKey, set[TopicKey]]]()
-        for claim in claims:
-            booked = claim.connection.route(route.source)
-            if booked is None or claim.subject != listed.subject:
-                named = (route.read_topic, route.written_topic)
-                booked = next(
-                    (
-                        other
-                        for other in filter(None, map(claim.connection.route, named))
-                        if (other.read_topic, other.written_topic) == named
-                    ),
-                    None,
-                )
-            if booked:
-                keys.append((claim.key, {(booked.source,)}))
-        yield f"topic {route.source}", keys
     if not listed.topics:
-        keys = []
-        for claim in claims:
-            topics: set[TopicKey] = {
+        listing = {
+            claim.key: {
                 (route.source,)
                 for route in claim.connection.topics
                 if not route.implied and (route.listed or claim.subject.id) == listed.id
             }
-            keys += [(claim.key, topics)] if topics else []
-        yield "", keys
+            for claim in claims
+        }
+        yield "", [(key, set[TopicKey](topics)) for key, topics in listing.items() if topics]
+        return
+    held = [(route, list(_keys_of(route, listed, claims))) for route in listed.topics]
+    if not any(keys for _, keys in held) and not any(c.subject == listed.subject for c in claims):
+        yield "", []
+        return
+    for route, keys in held:
+        yield f"topic {route.source}", keys
+
+
+def _keys_of(
+    route: Route, listed: Connection, claims: list[Claim]
+) -> Iterator[tuple[ClaimKey, set[TopicKey]]]:
+    for claim in claims:
+        named = (route.read_topic, route.written_topic)
+        booked = claim.connection.route(route.source) if claim.subject == listed.subject else None
+        for other in filter(None, map(claim.connection.route, dict.fromkeys(named))):
+            if booked is None and (other.read_topic, other.written_topic) == named:
+                booked = other
+        if booked:
+            yield claim.key, {(booked.source,)}
 
 
 def release_demand(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
-    waited = (request.demand,) * is_waiting(ledger, request)
-    held = ledger.claims_of_demand(request.demand) if waited else owned_claims(ledger, request)
+    waited = (request.demand,) * (request.demand in ledger.waiting)
+    held = ledger.claims_of_demand(request.demand) if waited else claims_of(ledger, request)
     after = ledger.without(held).without_waiting(waited)
     claims = claim_changes(ledger, after, [claim.key for claim in held])
     return after, Changes(claims=claims, waiting=waited)
@@ -355,9 +336,9 @@ def release_demand(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
 
 def renew_leases(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
     # a demand that waits has no lease yet, but its client may renew it already
-    if is_waiting(ledger, request) and not ledger.claims_of_demand(request.demand):
+    if request.demand in ledger.waiting and not ledger.claims_of_demand(request.demand):
         return ledger, Changes()
-    start, held = ledger, owned_claims(ledger, request)
+    start, held = ledger, claims_of(ledger, request)
     for claim in held:
         if claim.lease is not None:
             term = Term(claim.lease.seconds, claim.lease.slack)

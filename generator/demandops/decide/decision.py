@@ -200,10 +200,11 @@ def _refused(state: State, demand: Demand, faults: Iterable[Fault]) -> Refused:
         if appdef.deployment_request
     }
     named = with_definitions(demand, config)
-    return Refused(
+    told = (
         each if each.file else replace(each, field=goal_field(each.field, named, roles))
         for each in faults
     )
+    return Refused(dict.fromkeys(told))  # a fault of the requesters is one of each item
 
 
 def _admitted_or_waiting(
@@ -216,16 +217,18 @@ def _admitted_or_waiting(
         # the reference's action names no demand that could wait
         if demand.operation != "put" or any(each.code != NO_ROOM for each in refused.faults):
             raise
-        before = state.ledger.waiting.get(demand.demand)
-        mine = before is None or {*before.requesters} == {*demand.requesters()}
         # a demand that holds claims keeps them when it is refused, so it cannot wait as well
-        holds = state.ledger.claims_of_demand(demand.demand)
+        if state.ledger.claims_of_demand(demand.demand):
+            raise
+        if strangers := list(permission.owner_faults(demand, state.ledger, state.config)):
+            raise Refused(strangers) from None
         asked = with_separate_instances(demand, state.config)
-        if holds or not mine or not placement.may_wait(asked, state, checkpoint):
+        if not placement.may_wait(asked, state, checkpoint):
             raise
         if faults := list(throttle(asked, state.config)):
             raise Refused(faults) from None
         # a demand that is sent again keeps its place among those that wait
+        before = state.ledger.waiting.get(demand.demand)
         waiting = WaitingDemand(demand, before.since if before else now)
         reasons = tuple(each.message for each in refused.faults)
         who = waiting.requesters
@@ -402,6 +405,8 @@ def _booked(
     state: State, request: Demand, now: datetime, checkpoint: Checkpoint
 ) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
     checkpoint()
+    if strangers := list(permission.owner_faults(request, state.ledger, state.config)):
+        raise Refused(strangers)
     subjects = request.subjects()
     # Claims of the request replace those that overrides kept. Else a kept claim, which nobody
     # demands any longer, would contradict the request.

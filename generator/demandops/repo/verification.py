@@ -60,11 +60,10 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
         root = path.split("/", 1)[0]
         if root in (*GENERATED_ROOTS, NOTES_ROOT):
             continue
+        # of a folder, the files count
+        if path.startswith(_GONE) or isinstance(trees.entry(commit.tree, path), Tree):
+            continue
         if operation == "upgrade" and (path == ROOT_FILE or _only_removes_ignored(commit, path)):
-            continue
-        if path.startswith(_GONE):
-            continue
-        if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
             continue
         if root != claim_files.LEDGER_ROOT:
             yield path

@@ -57,6 +57,7 @@ class Evaluator:
                     ),
                     within(state.config.repo_settings.limits, self._repository.runtime),
                 )
+            self._approvals.refuse_strangers(decision)
             if decision.approval:
                 return decision
             # from here on the demand can no longer be taken back

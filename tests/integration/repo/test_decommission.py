@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops.model.demand.demand import Decommission
+from demandops.model.demand import goals
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -94,9 +94,9 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     """A decommission waits in the journal like any demand, so the next start carries it out."""
     generator = Generator(url)
     rig.book(generator, goal(1))
-    leaving = Decommission(id="vehicle01", kinds=frozenset({"node"}))
+    leaving = goals.decommission("vehicle01", frozenset({"node"}), "", "")
     with rig.away(bare):
-        generator.submit(leaving.goal(), "op-leave")
+        generator.submit(leaving, "op-leave")
         assert generator.close(timeout=0.3) is False
     assert rig.restart(url) is True
     assert rig.operations(bare)[-1] == "op-leave"

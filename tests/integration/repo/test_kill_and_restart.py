@@ -10,8 +10,8 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from demandops.model.demand import goals as demand_goals
 from demandops.repo.write.journal import DamagedJournal
-from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -25,17 +25,13 @@ LANES = 4
 
 
 def _client(lane: int) -> list[tuple[str, rig.Goal]]:
-    """Return a client's demands in order; of every three joins, two are followed by a leave.
-
-    No two joins have a requester in common. If two had one, a repeated leave of the first could end
-    the second (docs/decisions/0023-a-shutdown-takes-holds.md).
-    """
+    """Return a client's demands in order; of every three joins, two are followed by a leave."""
     made = []
     for turn in range(60):
         number = lane + turn * LANES
-        made.append((f"join-{number}", goal(number, alone=True)))
+        made.append((f"join-{number}", goal(number)))
         if turn % 3:
-            made.append((f"leave-{number}", goal(number, alone=True, shutdown=True)))
+            made.append((f"leave-{number}", goal(number, shutdown=True)))
     return made
 
 
@@ -166,7 +162,8 @@ def test_a_rollback_that_a_crash_left_in_the_journal_is_carried_out_at_the_next_
         rig.book(generator, goal(1))
         to, then = rig.tip(bare), rig.books(bare)
         rig.book(generator, goal(2))
-    back = evaluation.goal(to, drop_newer=True, reason="a test", who=("A", "a@example.org"))
+    who = ("A", "a@example.org")
+    back = demand_goals.rollback(to, drop_newer=True, reason="a test", who=who).goal
     drivers.start(bare, [[demand("back", back)]], die_at="journaled").listen()
     assert rig.books(bare) != then
     assert rig.restart(bare)

@@ -50,8 +50,9 @@ def put(demand: str, lease: Any = 60, who: str = "vehicle00", **more: Any) -> ri
     return goals.put(demand, who, "station00", **({} if lease is None else {"lease": lease}) | more)
 
 
-def renew(demand: str, who: str = "vehicle00") -> rig.Goal:
-    return {"kind": "Demand", "operation": "renew", "demand": demand, "requesters": [who]}
+def renew(demand: str, *who: str) -> rig.Goal:
+    who = who or ("vehicle00", "station00")
+    return {"kind": "Demand", "operation": "renew", "demand": demand, "requesters": [*who]}
 
 
 def held(generator: Generator, demand: str) -> tuple[Claim, ...]:
@@ -181,6 +182,8 @@ def test_odd_goals_are_refusals_and_no_faults_of_the_generator(
     release = {"kind": "Demand", "operation": "release"}
     with rig.running(bare) as generator:
         assert {claim.demand for claim in generator.snapshot.state.ledger} == {*names}
-        rig.book(generator, *(release | {"demand": n, "requesters": [n]} for n in names))
+        rig.book(
+            generator, *(release | {"demand": n, "requesters": [n, "station00"]} for n in names)
+        )
     assert rig.claims(bare) == []
     rig.assert_sound(bare, verify_last=3)

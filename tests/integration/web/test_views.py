@@ -24,6 +24,7 @@ from demandops.web.situation import CommitState, Situation
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes
+from tests.kit.goals import put
 from tests.kit.repo import GitRepo
 
 DETECTION = "od-edge-vehicle00"
@@ -225,7 +226,7 @@ def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: F
 def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     newest = follower.newest
     since = newest.now - timedelta(minutes=5)
-    waiting = WaitingDemand(read_goal(goals.put("later", "vehicle02")), since)
+    waiting = WaitingDemand(read_goal(put("later", "vehicle02")), since)
     ledger = replace(newest.commit_state.state.ledger, waiting=HashTrieMap({"later": waiting}))
     now = changed(follower, ledger=ledger)
     (cause,) = causes(now, follower, "vehicle02")

@@ -58,7 +58,9 @@ class Parties:
                 "id": f"f{each}",
                 "type": "object-detection-fusion",
                 "node": "edge",
-                "connect": self.random.choice(["auto", "mqtt", {"type": "mqtt", "broker": "cloud"}]),
+                "connect": self.random.choice(
+                    ["auto", "mqtt", {"type": "mqtt", "broker": "cloud"}]
+                ),
                 "inputs": {"ego_data": self._inputs("topic", "source")},
                 "deliver": [
                     {"output": "object-fusion.fused_objects", "node": node, "topic": topic}
@@ -91,7 +93,10 @@ class Parties:
         return demand | {"operation": "put"} | more
 
     def _join(self, number: int, who: list[str]) -> dict[str, Any]:
-        body = {"requester_ids": who, "ego_data_topics": self._inputs("topic_name", "source_node_id")}
+        body = {
+            "requester_ids": who,
+            "ego_data_topics": self._inputs("topic_name", "source_node_id"),
+        }
         apps = [
             {
                 "header": {"id": f"f{each}", "node_id": "edge"},

@@ -13,7 +13,7 @@ from tests.kit.memory import MemoryRepo
 from tests.kit.mutations import Form
 
 REFERENCE, OWN = (Form(model.model_json_schema()) for model in rich.GOAL_MODELS)
-FREE = {"GoalApplication.parameters", "DemandGoal.lease"}
+FREE = {"Application.parameters"}
 FREE_PLACES = ("applications[0].parameters", "applications[1].parameters_json")
 ELSEWHERE = {
     "connections[0].source_topics": "connections[0].target_topics",  # lengths then differ

@@ -261,7 +261,7 @@ def test_a_time_that_cannot_be_reckoned_with_is_refused(
     times = {"booked": AT, "until": AT.replace(day=30)}
     claim = Claim(LINK, "d", "r", ("c",), AT, Lease(1, LONGEST_S, times["until"]))
     found = fault_of(claim, (time_text(times[written]), edit))
-    assert found.message.startswith(f"'{edit}' {problem}")
+    assert problem in found.message
 
 
 def test_a_claim_of_any_year_survives_its_file() -> None:

@@ -44,10 +44,19 @@ def test_it_is_removed_and_all_else_stays(path: str, text: str, left: str) -> No
         (SERVICE, "parameters: {downAfter: 10m}\n"),
         (SERVICE, "# scaling: {downAfter: 10m}\n"),
         (SERVICE, "scaling: {downAfter: 10m\n"),
+        (SERVICE, "scaling: {downAfter: 10m}\n---\n"),
         (APPDEF, "services: {1: {scaling: {downAfter: 10m}}}\n"),
         (SERVICE, "? scaling\n: ? downAfter\n  : 10m\n  ? max\n  : 4\n"),
     ],
-    ids=["another file", "another field", "a comment", "invalid", "no text", "an odd form"],
+    ids=[
+        "another file",
+        "another field",
+        "a comment",
+        "invalid",
+        "two documents",
+        "no text",
+        "an odd form",
+    ],
 )
 def test_what_is_not_meant_or_cannot_be_removed_stays(path: str, text: str) -> None:
     assert without_ignored_fields(path, text) == text

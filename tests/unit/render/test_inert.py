@@ -121,7 +121,7 @@ def test_ids_are_read_back_as_they_were() -> None:
         (text,) = {
             claim["request"],
             *claim["requesters"],
-            claim.get("application", claim.get("connection")),
+            (claim.get("application") or claim["connection"])["id"],
         }
         claimed.append(text)
     assert sorted(claimed) == sorted(TRAPS * 2)

@@ -17,7 +17,8 @@ from demandops.model.config.base_model import duration_text, seconds_of
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain, Rule, matches
 from demandops.model.demand.demand import AnyDemand, Application, Demand, Item, Term
-from demandops.model.ledger.claim import Claim
+from demandops.model.ledger.claim import Claim, requesters_of
+from demandops.model.ledger.ledger import Ledger
 
 # pairs of a rule's field, such as ``nodes``, and a value that this field must allow
 Access = list[tuple[str, str]]
@@ -119,6 +120,55 @@ def _not_allowed(item: Item, domain: AccessDomain, access: Access) -> Iterator[F
 def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
     missing = (pair for pair in access if not matches(pair[1], getattr(rule, pair[0])))
     return next(missing, None)
+
+
+# ---- owners: the requesters for whom a demand holds claims or waits ----
+#
+# A demand is put anew, renewed and released by exactly its owners. If one common requester were
+# enough, a station that all vehicles name would open each vehicle's demand to all others. Nor does
+# a second requester who chooses the same demand id by chance change the demand of the first.
+
+
+def owner_faults(request: Demand, ledger: Ledger, config: Config) -> Iterator[Fault]:
+    """Yield a fault if the request changes a demand of others, which no rule lets it manage."""
+    waiting, claims = ledger.waiting.get(request.demand), ledger.claims_of_demand(request.demand)
+    owners = waiting.requesters if waiting else requesters_of(claims)
+    homes = None if waiting else [claim.held.home for claim in claims]
+    yield from stranger_faults(request, owners, homes, config)
+
+
+def stranger_faults(
+    request: Demand, owners: Iterable[str], homes: Iterable[str] | None, config: Config
+) -> Iterator[Fault]:
+    # ``homes`` are the nodes of the demand's claims; None if it waits for one
+    owners, asking = {*owners}, {*request.requesters()}
+    # the generator itself ends leases, and names nobody
+    if not owners:
+        return
+    if request.operation not in ("put", "release", "renew", "wait") or asking == owners:
+        return
+    strangers = asking - owners
+
+    def may_manage(domain: AccessDomain) -> bool:
+        return all(
+            any(
+                matches(who, rule.requesters) and all(matches(o, rule.manages) for o in owners)
+                for rule in domain.rules
+            )
+            for who in strangers
+        )
+
+    if homes is None:
+        is_managed = any(map(may_manage, config.domains.values()))
+    else:
+        domains = {home: config.domain_of[home] for home in homes if home in config.domain_of}
+        is_managed = bool(domains) and all(map(may_manage, domains.values()))
+    if not (strangers and is_managed):
+        message = (
+            f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; name exactly these "
+            "requesters, choose another demand id, or ask for a rule that 'manages' them in policy/"
+        )
+        yield fault("demand", message, code="not-yours")
 
 
 def with_lease_terms(request: AnyDemand, config: Config) -> AnyDemand:

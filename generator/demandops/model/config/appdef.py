@@ -303,7 +303,7 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
 
 # What happens if demands that share an application or a service ask for different versions.
 # `refuse`: the later demand is refused. `separate`: a version other than the default runs in an
-# instance of its own (`decide.admission.admitted_request`). `update`: the newest version runs,
+# instance of its own (`decide.admission.completing`). `update`: the newest version runs,
 # but a person must approve a change of the major version. `upgrade`: the newest version runs, even
 # if the major version changes.
 VersionPolicy = Literal["refuse", "separate", "update", "upgrade"]

@@ -19,6 +19,7 @@ from pydantic import (
     StringConstraints,
     TypeAdapter,
     ValidationError,
+    ValidationInfo,
 )
 from pydantic.alias_generators import to_camel
 from pydantic_core import PydanticKnownError
@@ -164,6 +165,20 @@ Approval = Literal["none", "required"]
 PART = ConfigDict(extra="forbid")
 
 
+# Given as context, it says that people or clients write what is read.
+GOAL = "goal"
+
+
+def _recorded(value: object, info: ValidationInfo) -> object:
+    if info.context == GOAL:
+        raise ValueError("is recorded by the generator; remove it")
+    return value
+
+
+# Marks a field that only the generator writes.
+RECORDED = BeforeValidator(_recorded)
+
+
 _AS_WRITTEN: Any = {"mode": "json", "by_alias": True, "exclude_defaults": True}
 
 
@@ -184,7 +199,7 @@ def _number(value: object) -> object:
     raise PydanticKnownError("float_type")
 
 
-plain_number = BeforeValidator(_number, json_schema_input_type=float)
+plain_number = BeforeValidator(_number)
 
 
 class FrozenModel(BaseModel):

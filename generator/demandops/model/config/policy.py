@@ -39,7 +39,8 @@ class Rule(CamelModel):
 
     ``nodes`` are the nodes of applications and the ends of connections. ``brokers`` are the nodes
     of brokers. ``peers`` are the other access domains that connections may come from and go to.
-    ``approval`` defaults to that of the access domain.
+    ``manages`` are patterns of requesters whose demands the rule's requesters may change, renew and
+    release, although they did not book them. ``approval`` defaults to that of the access domain.
     """
 
     name: DnsLabel
@@ -48,6 +49,7 @@ class Rule(CamelModel):
     nodes: Patterns = ("*",)
     brokers: Patterns = ("*",)
     peers: Items[base_model.Text] = ()
+    manages: Items[base_model.Text] = ()
     approval: base_model.Approval | None = None
 
 

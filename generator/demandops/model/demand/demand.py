@@ -21,11 +21,13 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 from pydantic import (
     AfterValidator,
     BeforeValidator,
+    ConfigDict,
     Field,
     PlainSerializer,
     Strict,
     StrictBool,
 )
+from pydantic.json_schema import SkipJsonSchema
 
 from demandops.base import naming
 from demandops.base.errors import Fault, fault
@@ -33,7 +35,7 @@ from demandops.base.naming import Subject, SubjectKind, TopicKey, absolute_topic
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_word
-from demandops.model.config.base_model import PART, Items, Moment, time_text, without
+from demandops.model.config.base_model import PART, RECORDED, Items, Moment, time_text, without
 from demandops.model.config.inventory import Position, read_condition
 
 # ---- applications ----
@@ -50,7 +52,7 @@ class InputTopic:
     type: str = ""
     # It was not the usual topic of its source when it was booked. The claim says so, because a name
     # that is made from it must not change while it is demanded (:mod:`.flows`).
-    further: StrictBool = False
+    further: Annotated[StrictBool, RECORDED, SkipJsonSchema()] = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "topic", absolute_topic(self.topic))
@@ -129,6 +131,12 @@ class Requirement:
         )
 
 
+def _with_parameters_json(schema: dict[str, Any]) -> None:
+    # the schema is that of a demand, where parameters may also be JSON text (:mod:`.goals`)
+    texts = {"type": "object", "additionalProperties": {"type": "string"}}
+    schema["properties"]["parameters_json"] = texts
+
+
 _CONNECT = type_word("auto", after=("none",))
 
 
@@ -162,7 +170,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     that no connection of the demand carries. ``services`` maps service names to nodes.
     """
 
-    __pydantic_config__: ClassVar = PART
+    __pydantic_config__: ClassVar = ConfigDict(**PART, json_schema_extra=_with_parameters_json)
 
     id: str = ""
     # ``#<number>`` if a goal of the reference's action gives the type as a number
@@ -179,16 +187,19 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         PlainSerializer(_written_connect),
     ] = Connect()
     deliver: Items[Delivery] = ()
-    # the requirements on the node, kept to choose again; None if the demand names the node
-    place: Requirement | None = None
+    # The requirements on the node, kept to choose again; None if the demand names the node. A place
+    # that requires nothing, as in each ROS message with a node, does not ask for a choice.
+    place: Annotated[
+        Requirement | None, AfterValidator(lambda place: None if place == Requirement() else place)
+    ] = None
     # the nodes of services that have one of their own, by service
     services: Mapping[str, str] = field(default_factory=dict)
     # this version runs beside others, and the id ends in it (:mod:`.completing`)
-    separate: StrictBool = False
+    separate: Annotated[StrictBool, RECORDED, SkipJsonSchema()] = False
     # the nodes to which an override moves services, by service
-    moved: Mapping[str, str] = field(default_factory=dict)
+    moved: Annotated[Mapping[str, str], RECORDED, SkipJsonSchema()] = field(default_factory=dict)
     # the services whose node the demand itself names; the generator chose the nodes of the others
-    named: Items[str] = ()
+    named: Annotated[Items[str], RECORDED, SkipJsonSchema()] = ()
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Application):

@@ -20,9 +20,9 @@ from demandops.base.errors import MOST_FAULTS, Fault, Refused, fault, field_path
 from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
-from demandops.connections.connection import RECORDED, Connection, Route
+from demandops.connections.connection import Connection, Route
 from demandops.connections.connection_types import by_number, type_numbered
-from demandops.model.config.base_model import FrozenModel, Items, faults_of, seconds_of
+from demandops.model.config.base_model import GOAL, FrozenModel, Items, faults_of, seconds_of
 from demandops.model.config.inventory import Coordinate, Position
 from demandops.model.config.repo_settings import ROOT_FILE, Limits
 from demandops.model.demand.demand import (
@@ -132,68 +132,43 @@ def _named(held: Held) -> Held:
     return replace(held, named=tuple(sorted(held.services)))  # those whose node the demand names
 
 
-# What the generator records of an application and its inputs, which a demand cannot give.
-_RECORDED = {"separate", "moved", "named"}
-
-
-def _applications_read(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
-    """Return a goal with ``parameters_json`` united with ``parameters``, and the faults of both."""
+def _with_parameters(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
+    """Return a goal with ``parameters_json`` read into ``parameters``, and the faults of both."""
     faults: list[Fault] = []
+
+    def read(index: int, app: Any) -> Any:  # noqa: ANN401 - plain data
+        given = app.get("parameters", {}) if isinstance(app, dict) else None
+        texts = app.get("parameters_json", {}) if isinstance(app, dict) else None
+        if not isinstance(given, dict) or not isinstance(texts, dict):
+            return app
+        where, values = f"applications[{index}]", dict(given)
+        problems = {f"{where}.parameters.{name}": _value_problem(given[name], 0) for name in given}
+        for name, text in texts.items():
+            problem = "is already given in parameters; give it once"
+            if name not in given:
+                values[name], problem = _json_value(text)
+            problems[f"{where}.parameters_json.{name}"] = problem
+        faults.extend(fault(field, problem) for field, problem in problems.items() if problem)
+        others = {name: value for name, value in app.items() if name != "parameters_json"}
+        return others | ({"parameters": values} if values else {})
+
     listed = goal.get("applications")
-    if not isinstance(listed, list):
-        return goal, faults
-    applications = []
-    for index, app in enumerate(listed):
-        where = f"applications[{index}]"
-        if not isinstance(app, dict):
-            applications.append(app)
-            continue
-        for name in sorted(_RECORDED & app.keys()):
-            faults.append(fault(f"{where}.{name}", "is recorded by the generator; remove it"))
-        inputs = app.get("inputs")
-        for role, topics in inputs.items() if isinstance(inputs, dict) else ():
-            for place, topic in enumerate(topics if isinstance(topics, list) else ()):
-                if isinstance(topic, dict) and "further" in topic:
-                    at = f"{where}.inputs.{role}[{place}].further"
-                    faults.append(fault(at, "is recorded by the generator; remove it"))
-        given, texts = app.get("parameters", {}), app.get("parameters_json", {})
-        read = {name: value for name, value in app.items() if name != "parameters_json"}
-        if isinstance(given, dict) and isinstance(texts, dict):
-            values = dict(given)
-            for name, text in texts.items():
-                place_of = f"{where}.parameters_json.{name}"
-                if name in given:
-                    faults.append(fault(place_of, "is already given in parameters; give it once"))
-                    continue
-                try:
-                    values[name] = json.loads(text)
-                except (json.JSONDecodeError, TypeError):
-                    message = 'is not JSON; text needs its own quotes, as in "\\"fast\\""'
-                    faults.append(fault(place_of, message))
-                except RecursionError:
-                    faults.append(fault(place_of, _TOO_DEEP))
-                except ValueError:  # Python refuses to convert integers of more than 4300 digits
-                    message = "has an integer of too many digits; write a shorter one"
-                    faults.append(fault(place_of, message))
-            for name, value in values.items():
-                if problem := _value_problem(value, 0):
-                    field = "parameters" if name in given else "parameters_json"
-                    faults.append(fault(f"{where}.{field}.{name}", problem))
-            read["parameters"] = values
-        elif isinstance(given, dict):
-            faults.append(fault(f"{where}.parameters_json", "must be a mapping of names to JSON"))
-        applications.append(read)
-    return goal | {"applications": applications}, faults
+    if isinstance(listed, list):
+        goal = goal | {"applications": [read(index, app) for index, app in enumerate(listed)]}
+    return goal, faults
 
 
-def _recorded_of_topics(goal: dict[str, Any]) -> Iterator[Fault]:
-    connections = goal.get("connections")
-    for index, connection in enumerate(connections if isinstance(connections, list) else ()):
-        topics = connection.get("topics") if isinstance(connection, dict) else ()
-        for place, topic in enumerate(topics if isinstance(topics, list) else ()):
-            for name in sorted(RECORDED & topic.keys() if isinstance(topic, dict) else ()):
-                at = f"connections[{index}].topics[{place}].{name}"
-                yield fault(at, "is recorded by the generator; remove it")
+def _json_value(text: object) -> tuple[Any, str]:
+    """Return the value of a JSON text, or what is wrong with it."""
+    try:
+        value = json.loads(text)  # type: ignore[arg-type]
+    except (json.JSONDecodeError, TypeError):
+        return None, 'is not JSON; text needs its own quotes, as in ""fast""'
+    except RecursionError:
+        return None, _TOO_DEEP
+    except ValueError:  # Python refuses to convert integers of more than 4300 digits
+        return None, "has an integer of too many digits; write a shorter one"
+    return value, _value_problem(value, 0)
 
 
 # How many levels a parameter's value may have. It is a part of a claim's file, which may have 100.
@@ -374,8 +349,8 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
     if not is_demand_goal(goal):
         demand = _parsed(WireGoal, goal, faults)
     else:
-        united, faults = _applications_read(goal)
-        demand = _parsed(DemandGoal, united, [*faults, *_recorded_of_topics(goal)])
+        united, faults = _with_parameters(goal)
+        demand = _parsed(DemandGoal, united, faults)
     return replace(demand, goal=goal)
 
 
@@ -383,7 +358,7 @@ def _parsed(
     model: type[DemandGoal | WireGoal], goal: dict[str, Any], faults: list[Fault]
 ) -> Demand:
     try:
-        parsed = model.model_validate(goal)
+        parsed = model.model_validate(goal, context=GOAL)
     except ValidationError as error:
         raise Refused([*faults, *faults_of(error, model, most=MOST_FAULTS)]) from None
     if faults := [*faults, *parsed.faults()]:

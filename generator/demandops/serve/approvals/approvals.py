@@ -47,6 +47,7 @@ from demandops.serve.approvals.proposal import (
     code,
     decide_in_turn,
     key_of,
+    proposed_stranger_faults,
     pull_request_texts,
     push_options,
     releases,
@@ -112,7 +113,7 @@ class Approvals:
             if (request := _release_request(ticket, state)) is None:
                 continue
             for proposal in self._proposals.values():
-                if not releases(request, proposal.requests):
+                if not releases(request, proposal.requests, state.config):
                     continue
                 self._demands.withdraw_proposed(proposal.tickets, RELEASED)
                 if proposal.record.commits:
@@ -124,19 +125,22 @@ class Approvals:
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier):
-            if request and isinstance(result, Decision) and releases(request, [result.request]):
+            if (
+                request
+                and isinstance(result, Decision)
+                and releases(request, [result.request], state.config)
+            ):
                 earlier[index] = (ticket, errors.Withdrawn(RELEASED))
                 by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
         """Add a demand to the proposal of the same demand, or to a new one, or answer it."""
-        request, waiting = decision.request, self._waiting(decision.request)
-        owners = {name for old in waiting for name in old.requesters()}
-        if owners and not owners & set(request.requesters()):
-            message = f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; "
-            message += "choose another demand id"
-            self._demands.fail([ticket], Refused([fault("demand", message, code="not-yours")]))
+        try:
+            self.refuse_strangers(decision)
+        except Refused as refused:
+            self._demands.fail([ticket], refused)
             return
+        request, waiting = decision.request, self._waiting(decision.request)
         # What a person has seen on a branch never becomes another demand there. So a put with other
         # content gets a branch of its own, and replaces the earlier proposal.
         goal = json.dumps(ticket.demand.goal)
@@ -175,6 +179,13 @@ class Approvals:
         key = key_of(request)
         waiting = (proposal for proposal in self._proposals.values() if proposal.waits)
         return [proposal for proposal in waiting if key in map(key_of, proposal.requests)]
+
+    def refuse_strangers(self, decision: Decision) -> None:
+        # who may not change a demand that is proposed
+        request = decision.request
+        pending = [old for proposal in self._waiting(request) for old in proposal.requests]
+        if faults := proposed_stranger_faults(request, pending, decision.state.config):
+            raise Refused(faults)
 
     def withdraw_replaced(self, request: Demand) -> None:
         # by a put that needs no approval

@@ -12,13 +12,14 @@ from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
-from demandops.base.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
+from demandops.base.errors import DemandOpsError, Fault, InvalidInput, TurnedDown, Withdrawn
 from demandops.base.quoting import harmless, one_line
 from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.admission import permission
 from demandops.decide.changeset import FileReader
 from demandops.decide.decision import Decision, admit, decide
 from demandops.decide.state import State
+from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand
 from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.forge import PullRequest
@@ -132,13 +133,22 @@ class Proposal:
         return {name for request in self.requests for name in request.requesters()}
 
 
-def releases(request: Demand, pending: Sequence[Demand]) -> bool:
-    # with the key and a requester of one of the demands; names all their subjects or is a Release
-    requesters = {name for other in pending for name in other.requesters()}
-    if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
+def releases(request: Demand, pending: Sequence[Demand], config: Config) -> bool:
+    # has the key of one of the demands and may end it; names all their subjects or is a Release
+    if key_of(request) not in map(key_of, pending):
+        return False
+    if proposed_stranger_faults(request, pending, config):
         return False
     subjects = {subject for other in pending for subject in other.subjects()}
     return request.operation == "release" or subjects <= set(request.subjects())
+
+
+def proposed_stranger_faults(
+    request: Demand, pending: Iterable[Demand], config: Config
+) -> list[Fault]:
+    owners = {name for other in pending for name in other.requesters()}
+    homes = [item.held.home for other in pending for item in other.demanded]
+    return list(permission.stranger_faults(request, owners, homes, config))
 
 
 def key_of(request: Demand) -> tuple[str, ...]:
