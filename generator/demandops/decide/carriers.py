@@ -13,7 +13,7 @@ from dataclasses import replace
 
 from demandops.base.naming import SubjectKind, TopicKey, hash_of, id_problem, topic_problem
 from demandops.base.quoting import quoted
-from demandops.connections.connection import Connection, Route, RouteKey
+from demandops.connections.connection import Connection, Route, RouteKey, faults
 from demandops.connections.connection_types import choose_type, type_named
 from demandops.decide.admission.admission import with_chosen_types
 from demandops.decide.planning.flows import Flow, flows, is_bridged
@@ -145,7 +145,7 @@ def with_carriers(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDema
     carriers = _Carriers(request, ledger, config)
     for item in request.demanded:
         listed = item.held
-        if isinstance(listed, Connection) and listed.topics and _has_valid_ids(item, listed):
+        if isinstance(listed, Connection) and listed.topics and _is_well_formed(item, listed):
             for index, route in enumerate(listed.topics):
                 carriers.place(item, listed, index, route)
         else:
@@ -154,10 +154,10 @@ def with_carriers(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDema
     return replace(request, demanded=tuple(carriers.united()), notes=notes)
 
 
-def _has_valid_ids(item: Item, listed: Connection) -> bool:
-    # admission refuses others, so their routes stay where they are listed
+def _is_well_formed(item: Item, listed: Connection) -> bool:
+    # admission refuses what is not, wherever its routes could go
     ids = [listed.id] * item.is_listed + [listed.broker] * bool(listed.broker)
-    return not any(map(id_problem, ids))
+    return not any(map(id_problem, ids)) and not any(faults("topics", listed.topics))
 
 
 class _Carriers:
