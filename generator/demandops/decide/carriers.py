@@ -192,18 +192,14 @@ class _Carriers:
             header = self._standing[carrier.id] = replace(wanted, type=kind, topics=())
         elif current is None and header.nodes != listed.nodes:
             header = replace(listed, topics=())  # a contradiction, which the booking refuses
+        elif current and {*header.nodes} != {*carrier.nodes}:
+            header = replace(carrier, topics=())  # as well
         is_elsewhere = item.is_listed and header.id != listed.id
         if current and route.implied:
             booked_route = replace(current, implied=True, listed="")
         else:
             booked_route = replace(route, listed=listed.id if is_elsewhere else "")
-            if carried and current and carrier.nodes == header.nodes:
-                booked_route = replace(
-                    booked_route,
-                    source=current.source,
-                    target=current.target,
-                    reverse=current.reverse,
-                )
+        booked_route = _turned(booked_route, key, header, current)
         differs = _difference(listed, header, self._config)
         if is_elsewhere or differs:
             what = f" of connection '{listed.id}'" if item.is_listed else ""
@@ -270,6 +266,18 @@ class _Carriers:
                 places=places,
                 is_listed=listing is not None,
             )
+
+
+def _turned(route: Route, key: RouteKey, carrier: Connection, current: Route | None) -> Route:
+    """Return the route from the source of its carrier to the target, or back."""
+    if carrier.source == carrier.target:
+        turned = current or route
+        names = (turned.source, turned.target, turned.reverse)
+    elif carrier.source == key.sender:
+        names = (key.topic, key.target, False)
+    else:
+        names = (key.target, key.topic, True)
+    return replace(route, source=names[0], target=names[1], reverse=names[2])
 
 
 def _difference(listed: Connection, carrier: Connection, config: Config) -> str:
