@@ -303,19 +303,29 @@ def doubled(connection: Connection, ledger: Ledger) -> Iterator[tuple[int, str]]
 
 def brought_twice(connection: Connection, ledger: Ledger) -> Iterator[tuple[int, str]]:
     """Yield (index, words) for each route to a topic that another route brings to the node too."""
-    for index, route in enumerate(connection.topics):
-        key = connection.key_of(route)
-        for claim in ledger.claims_bringing(key.receiver, key.target):
-            others = map(claim.connection.key_of, claim.connection.topics)
-            rival = next((o for o in others if (o[2:] == key[2:]) and o != key), None)
-            if rival is not None:
-                yield (
-                    index,
-                    f"{quoted(key.target)} comes to {quoted(key.receiver)} from "
-                    f"{quoted(key.sender)} by connection {quoted(connection.id)}, and from "
-                    f"{quoted(rival.sender)} by connection {quoted(claim.subject.id)}",
-                )
-                break
+    keys = [connection.key_of(route) for route in connection.topics]
+    own: dict[tuple[str, ...], list[RouteKey]] = {}
+    for key in keys:
+        own.setdefault(key[2:], []).append(key)
+    for index, key in enumerate(keys):
+        holders = ledger.route_holders(key)
+        rivals = [(other, connection.id) for other in own[key[2:]] if other != key]
+        bringing = ledger.bringing(key.receiver, key.target)
+        # thousands of claims may bring the topic, and mostly all by this route
+        for holder in bringing if len(bringing) > len(holders) and not rivals else ():
+            claim = ledger.get(holder) if holder not in holders else None
+            for route in claim.connection.topics if claim else ():
+                other = claim.connection.key_of(route)  # type: ignore[union-attr]
+                if other[2:] == key[2:]:
+                    rivals.append((other, holder.subject.id))
+        if rivals:
+            rival, id = min(rivals)
+            yield (
+                index,
+                f"{quoted(key.target)} comes to {quoted(key.receiver)} from {quoted(key.sender)} "
+                f"by connection {quoted(connection.id)}, and from {quoted(rival.sender)} by "
+                f"connection {quoted(id)}",
+            )
 
 
 def chosen_twice(

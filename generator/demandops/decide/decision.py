@@ -317,7 +317,8 @@ class _Trials:
                 "too many nodes would have to be tried for this demand; name a node for each "
                 "application, or split the demand"
             )
-        request, config = placed(request, self._state), self._state.config
+        config = self._state.config
+        request = placed(request, self._state, self._checkpoint)
         if next(admission.faults(request, config), None):
             return False
         for item in _paced(request.demanded, self._checkpoint):

@@ -45,15 +45,17 @@ def completed(
     demand, not_placed = placement.with_chosen_nodes(
         demand, state, state.usage(), trial, checkpoint
     )
-    return placed(demand, state), [*unclear, *not_placed]
+    return placed(demand, state, checkpoint), [*unclear, *not_placed]
 
 
-def placed(demand: AnyDemand, state: State) -> AnyDemand:
+def placed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -> AnyDemand:
     """Return a demand, whose nodes are chosen, with all else that the generator adds."""
     config, ledger = state.config, state.ledger
     demand = carriers.with_implied_routes(demand, ledger, config)
+    checkpoint()
     # before what depends on the connection: its lease, type, permission, quota and approval
     demand = carriers.with_carriers(demand, ledger, config)
+    checkpoint()
     demand = permission.with_lease_terms(demand, config)
     demand = admission.with_chosen_types(demand, config, ledger.connection)
     if demand.operation == "join":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from operator import attrgetter
@@ -129,8 +129,11 @@ class Ledger:
     def claims_bringing(self, target: str, topic: str) -> tuple[Claim, ...]:
         return self._claims("brings", target, topic)
 
-    def route_holders(self, key: RouteKey) -> Iterable[ClaimKey]:
+    def route_holders(self, key: RouteKey) -> Collection[ClaimKey]:
         return self.index.get(("route", *key)) or ()
+
+    def bringing(self, target: str, topic: str) -> Collection[ClaimKey]:
+        return self.index.get(("brings", target, topic)) or ()
 
     def is_carried_to(self, target: str, topic: str) -> bool:
         return ("brings", target, topic) in self.index
