@@ -78,7 +78,8 @@ def _implied(flow: Flow, connect: Connect, route: Route) -> Connection:
     kind = None if connect.type == "auto" else type_named(connect.type)
     type = route.type or (flow.type if kind and kind.needs_types else "")
     route = replace(route, type=type, implied=True)
-    return Connection("", kind, flow.sender, flow.receiver, connect.broker, (route,))
+    broker = "" if id_problem(connect.broker) else connect.broker  # admission refuses it
+    return Connection("", kind, flow.sender, flow.receiver, broker, (route,))
 
 
 def _demand_of(request: Demand, item: Item) -> str:

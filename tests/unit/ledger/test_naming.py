@@ -154,7 +154,15 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
         assert len({*map(as_the_reference, ids_of_topics)}) < len(ids_of_topics), taken
         return
     places = {*placed.values()}
+    brokers = repo.config.brokers.keys()
+    derived = {
+        (place, *topic)
+        for place in places
+        for topic in asked
+        if topic[1] != place and {topic[1], place} & brokers
+    }
     releases = len(places) * len(asked) + len(applications) + 2 * len(connections)
+    releases += 2 * len(derived)
     assert len(taken.releases) == len({release.name for release in taken.releases}) == releases
     manifests = [*repo.rendered().values()]
     assert len(manifests) == releases

@@ -57,6 +57,8 @@ def counted(ledger: Ledger) -> Books:
     books = defaultdict[str, list[str]](list)
     for claim in ledger:
         if not claim.is_on_application:
+            if claim.subject.id.startswith("derived/"):  # the reference derives none
+                continue
             books[resource("mqtt-connection", claim.subject.id)] += claim.requesters
             continue
         fusion = resource("of", claim.subject.id)
@@ -84,6 +86,8 @@ def running(repo: MemoryRepo) -> Books:
         else:
             runs[resource("od", service["node"], service["source"])] |= topics
     for id, entry in books["connections"].items():
+        if id.startswith("derived/"):  # the reference leaves a topic that nobody carries
+            continue
         runs[resource("mqtt-connection", id)] |= {*entry["topics"]}
     return {name: sorted(topics) for name, topics in runs.items()}
 
