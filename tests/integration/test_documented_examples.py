@@ -98,7 +98,7 @@ def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> Non
     ]
     assert (decision.lease_s, decision.warnings) == (600, ())
     goal = data("demand.md", "id: station00/collective-perception")
-    assert len(MemoryRepo().send(goal).changes.claims) == 2
+    assert len(MemoryRepo().send(goal).changes.claims) == 3
 
 
 def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:

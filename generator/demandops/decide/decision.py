@@ -344,6 +344,9 @@ def _carried_out(
     if isinstance(request, Drain):
         request = relocation.with_moves(request, state, state.usage(), state.names(), MOST_TRIALS)
     if isinstance(request, Restoration):
+        # claims of before the upgrade may carry a route twice
+        united, _ = carriers.with_one_carrier(ledgers.ledger_of(request.claims))
+        request = replace(request, claims=tuple(united))
         request = relocation.with_restored_moves(request, state)
         faults = list(rollback.faults(request, state))
         if faults:

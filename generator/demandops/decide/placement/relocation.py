@@ -30,7 +30,14 @@ from demandops.model.demand.demand import Application, Demand, InputTopic, Item,
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim, ClaimKey, requesters_of
-from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
+from demandops.model.ledger.ledger import (
+    Changes,
+    ClaimChange,
+    Ledger,
+    World,
+    claim_changes,
+    ledger_of,
+)
 
 # ---- when an application moves, the connections of its demands follow, with type and options ----
 
@@ -280,9 +287,7 @@ def with_restored_moves(request: Restoration, world: World) -> Restoration:
         claim.is_on_application and claim.application.moved for claim in request.claims
     ):
         return request
-    ledger = Ledger(ended=world.ledger.ended)
-    for claim in request.claims:
-        ledger = ledger.replace(claim.key, claim)
+    ledger = replace(ledger_of(request.claims), ended=world.ledger.ended)
     return replace(request, claims=tuple(following_overrides(replace(world, ledger=ledger)).ledger))
 
 

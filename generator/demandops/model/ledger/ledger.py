@@ -278,6 +278,13 @@ class Ledger:
         return sum(len(claims) for claims in self.claims.values())
 
 
+def ledger_of(claims: Iterable[Claim]) -> Ledger:
+    ledger = Ledger()
+    for claim in claims:
+        ledger = ledger.replace(claim.key, claim)
+    return ledger
+
+
 def minute_of(moment: datetime) -> str:
     # in UTC, and sorts like the time
     return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
