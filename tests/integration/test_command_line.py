@@ -105,7 +105,7 @@ class TestRequest:
     def test_json_and_text_tell_the_outcome_of_each(
         self, on: On, demandops: Run, state: GitRepo, tmp_path: Path
     ) -> None:
-        asked = goal([application(), application("other")], shutdown=True)
+        asked = goal([application(), application("other")], id="r", shutdown=True)
         goals = goal([application()], id="r"), goal([application(node="egde")], id="s"), asked
         git(tmp_path, "clone", "-q", "--bare", str(state.path), "other.git")
         other = GitRepo(tmp_path / "other.git")
@@ -132,7 +132,7 @@ class TestRequest:
         log = git(other, "rev-list", "main").split()
         assert ran.out.splitlines() == [
             f"standard input: request 0 'r' booked in {log[1]}",
-            f"standard input: request 2 'request' released in {log[0]}",
+            f"standard input: request 2 'r' released in {log[0]}",
         ]
         assert ran.err.splitlines() == [
             f"  warning: {warning}",

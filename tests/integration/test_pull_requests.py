@@ -178,7 +178,7 @@ def test_the_check_of_another_render_version_says_so(
 ) -> None:
     monkeypatch.setattr(checking, "RENDER_VERSION", 4)
     told = check().err
-    assert told.startswith("error: demandops.yaml:15: renderVersion: is 2, but this program ")
+    assert told.startswith("error: demandops.yaml:15: renderVersion: is 3, but this program ")
 
 
 # ---- branches ----

@@ -34,11 +34,11 @@ PARTS = ("generator", "ros_bridge", "templates", "appdefs", "state-repo-skeleton
 ROOT_FILE = "demandops.yaml"
 URL = "https://git.example/fleet/state-repo.git"
 OLDER = (
-    "demandops.yaml: renderVersion: is 2, but this generator renders version 3; stop older "
+    "demandops.yaml: renderVersion: is 3, but this generator renders version 4; stop older "
     "generators, then run `demandops upgrade` to render everything again"
 )
 NEWER = (
-    "demandops.yaml: renderVersion: is 3, but this generator renders version 2; update the "
+    "demandops.yaml: renderVersion: is 4, but this generator renders version 3; update the "
     "generator"
 )
 
@@ -61,7 +61,7 @@ for line in commands:
 
 @pytest.fixture(scope="session")
 def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subprocess.Popen[str]]:
-    """A process that runs commands of a program with render version 3 and another time-out."""
+    """A process that runs commands of a program with render version 4 and another time-out."""
     folder = tmp_path_factory.mktemp("newer")
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
@@ -200,7 +200,7 @@ def test_a_newer_program_serves_only_after_an_upgrade_and_the_older_only_before(
         assert newer("request", "-", *dry, stdin=goal) == (1, "", f"error: {OLDER}\n")
     assert newer("bookkeeping").code == 0
     assert [row["skipped"] for row in newer("verify", "--output", "json").json()] == [
-        "rendered by version 2, but this program renders version 3"
+        "rendered by version 3, but this program renders version 4"
     ]
     assert state.tip == before
 
@@ -253,4 +253,4 @@ def test_an_upgrade_that_is_reverted_gives_the_repo_back_to_the_older_program(
 def test_a_newer_program_lays_down_a_repo_of_its_own_version(newer: Run, tmp_path: Path) -> None:
     folder = tmp_path / "fleet"
     assert newer("init", str(folder)).code == 0
-    assert "renderVersion: 3\n" in (folder / ROOT_FILE).read_text()
+    assert "renderVersion: 4\n" in (folder / ROOT_FILE).read_text()

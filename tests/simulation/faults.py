@@ -103,16 +103,14 @@ def in_reverse(right: Wrong, *given: Any) -> Any:
 
 
 plant("let_strangers_change_a_demand", 1, permission, "stranger_faults", lambda *_: ())
-plant("release_only_the_first_claim", 17, booking, "claims_of", first_only)
+plant("release_only_the_first_claim", 47, booking, "claims_of", first_only)
 plant("replace_what_was_joined", 2, Claim, "extending", itself)
 plant("commit_what_is_booked_already", 15, Claim, "after_booking", itself)
 plant("grant_one_claim_too_many", 4, quotas, "_held", lambda held, *given: held(*given) - 1)
 
 
 @wrong(16, booking, "shut_down")
-def let_a_shutdown_take_from_any_join_of_its_request(
-    shut_down: Any, ledger: Any, asked: Any
-) -> Any:
+def let_a_shutdown_end_any_join_of_its_request(shut_down: Any, ledger: Any, asked: Any) -> Any:
     """Find a claim by the request id and one of the requesters."""
     made = []
     for item in asked.demanded:
@@ -130,7 +128,7 @@ def take_one_common_requester_for_the_owner(
     return () if owners & {*request.requesters()} else faults(request, owners, *more)
 
 
-@wrong(16, Claim, "without_topics")
+@wrong(0, Claim, "without_topics")
 def end_the_whole_claim_by_a_shutdown_of_some_topics(_: Any, claim: Any, gone: Any) -> None:
     return None
 
@@ -180,7 +178,7 @@ def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: An
 plant("take_the_first_domain", 1, Config, "nodes_of", lambda _, config, node: (node,))
 
 
-@wrong(100, completing, "_chosen")
+@wrong(22, completing, "_chosen")
 def forget_what_is_booked_in_a_domain(chosen: Any, one: Any, booked: Any, *more: Any) -> Any:
     return chosen(one, {}, *more)
 

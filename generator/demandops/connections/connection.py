@@ -269,6 +269,7 @@ class Connection:
             key = self.key_of(route)
             yield ("route", *key)
             yield ("brings", key.receiver, key.target)
+            yield ("from", key.sender)
 
 
 # ---- the interface of a connection type, and of the clients that it plans ----

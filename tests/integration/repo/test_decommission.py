@@ -6,11 +6,17 @@ from pathlib import Path
 
 import pytest
 import yaml
+from demandops.connections.connection import Connection, Route
+from demandops.connections.mqtt import MQTT
 from demandops.model.demand import goals
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import Claim
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.cli import Ran, Run
+from tests.kit.memory import NOW
+from tests.kit.repo import GitRepo
 from tests.kit.rig import Person, goal
 
 
@@ -69,6 +75,19 @@ def test_with_a_requester_goes_all_that_is_claimed_in_its_name(
     assert (commit.all("Node"), commit.all("Requester")) == ([], ["station00", "user1"])
     assert (rig.claims(bare, "user1"), len(rig.claims(bare, "user2"))) == ([], 2)
     rig.book(generator, goal(1))  # user1 may demand again
+    rig.assert_sound(bare)
+
+
+def test_a_claim_from_before_ids_had_one_form_can_be_released(
+    generator: Generator, bare: Path, decommission: Run
+) -> None:
+    link = Connection("c", MQTT, "vehicle00", "edge", "edge", (Route("/a", "/a"),))
+    old = Claim(link, "cafe\u0301", "d", ("user1",), NOW)
+    GitRepo(bare).commit({claim_files.path_of(old.key): claim_files.text_of(old)})
+    generator.fetch_now()
+    rig.wait_until(lambda: generator.snapshot.state.ledger.get(old.key), "the claim is read")
+    assert decommission("user1").code == 0
+    assert rig.claims(bare) == []
     rig.assert_sound(bare)
 
 

@@ -112,6 +112,32 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
     assert expiries(bare) == []
 
 
+def test_who_could_not_renew_while_no_generator_ran_can_after_the_start(
+    clock: Clock, bare: Path
+) -> None:
+    with rig.running(bare, runtime=clock) as generator:
+        rig.book(generator, put("alive", 600), put("gone"))
+    clock.pass_(3600)
+    with rig.running(bare, runtime=clock) as generator:
+        rig.book(generator, renew("alive"))
+        clock.pass_(60)
+        wait_until_gone(generator, "gone")
+        assert held(generator, "alive")
+    assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["gone"]]
+
+
+def test_a_generator_that_starts_holds_up_no_end_at_another(
+    clock: Clock, url: str, bare: Path
+) -> None:
+    with rig.running(url, runtime=clock) as generator:
+        rig.book(generator, put("d"))
+        clock.pass_(50)
+        with rig.running(url, runtime=clock):
+            clock.pass_(11)
+            wait_until_gone(generator, "d")
+    assert len(expiries(bare)) == 1
+
+
 def test_an_end_that_waits_while_the_clock_is_set_back_does_not_come(
     clock: Clock, url: str, bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

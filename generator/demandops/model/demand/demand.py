@@ -344,6 +344,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ("moved",)
         for role, topic in self.all_inputs():
             yield ("takes", topic.source, topic.topic)
+            yield ("from", topic.source)
             yield ("node", topic.source)
             if topic.further or self.separate:
                 yield ("further", topic.part_in(self.own_version))
@@ -529,10 +530,7 @@ class Demand:
         """Return what keeps demands that share it in their order; None touches everything."""
         if self.operation in ("decommission", "rollback"):
             return None
-        # Goals of the reference's action that share a requester keep their order. For example, of
-        # two equal shutdowns, the second has an effect only if a join came between them.
-        names = self.requesters() if self.is_reference else ()
-        return frozenset((*self.subjects(), ("demand", self.demand), *names))
+        return frozenset((*self.subjects(), *([("demand", self.demand)] if self.demand else ())))
 
 
 AnyDemand = TypeVar("AnyDemand", bound=Demand)

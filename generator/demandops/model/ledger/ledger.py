@@ -98,6 +98,11 @@ class Ledger:
             if claim is not None:
                 yield claim
 
+    def claims_from(self, node: str) -> Iterator[Claim]:
+        # that read a topic of the node or carry one from it, in no order
+        keys = self.index.get(("from", node)) or ()
+        return (claim for key in keys if (claim := self.get(key)))
+
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
         for claim in self.each_reading(source, topic):
             if inputs := claim.application.inputs_from(role, source, topic):
