@@ -294,7 +294,7 @@ class History:
         self.oracle.check()
         if found := sorted(self._files("ledger/waiting").items()):
             path, text = self.chance.choice(found)
-            demand = plain_yaml.load(text)["demand"]
+            demand = plain_yaml.load(text)["goal"]["demand"]
             self.oracle.edits[self._commit({path: None})] = lambda books: books.waiting.pop(demand)
 
     def _move_channel(self) -> None:

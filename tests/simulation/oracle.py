@@ -205,8 +205,9 @@ class Oracle:
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
         return {
-            one["demand"]: (one["priority"], str(one["since"]), frozenset(one["requesters"]))
+            goal["demand"]: (goal.get("priority", 0), str(since), frozenset(goal["requesters"]))
             for one in map(plain_yaml.load, texts)
+            for goal, since in [(one["goal"], one["since"])]
         }
 
     def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:
