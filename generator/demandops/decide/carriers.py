@@ -92,34 +92,38 @@ class _StandingRoutes:
         self._by_target: dict[ClaimKey, dict[tuple[str, str], list[Route]]] = {}
 
     def serving(self, flow: Flow, request: Demand, demand: str) -> tuple[Claim, Route] | None:
-        """Return the claim and route that bring an input already, if another name at its source.
+        """Return the claim and route that bring an input already, perhaps by another source name.
 
         A connection may give a topic of its source the name that applications know. A route with
         the flow's own name goes before such a route, and one of the demand before one of others.
         """
         is_join = request.operation == "join"
-        own = [(0, claim, route) for claim, route in self._bringing(flow) if claim.demand == demand]
-        others = [(1, c, r) for c, r in self._bringing(flow) if c.demand != demand]
-        found = []
-        for rank, claim, route in (*own, *others):
-            key = claim.connection.key_of(route)
-            # from another node, only an earlier goal of the demand itself brings it
-            if key.sender != flow.sender and not (is_join and rank == 0 and not route.implied):
-                continue
-            is_same = key.topic == flow.topic
-            if not is_same and (flow.is_output or flow.delivery is not None):
-                continue
-            # a put gives up what it listed and lists no longer
-            if rank == 0 and not is_same and not is_join and not route.implied:
-                continue
-            found.append((rank, not is_same, claim.subject.id, claim, route))
-        if not found:
-            return None
-        *_, claim, route = min(found, key=lambda each: each[:3])
-        return claim, route
+        same = RouteKey(flow.sender, flow.topic, flow.receiver, flow.target)
+        bringing = self._ledger.bringing(flow.receiver, flow.target)
+        exact = sorted(self._ledger.route_holders(same), key=_order)[:1]
+        # thousands of claims may bring a topic, mostly by this very route
+        others = bringing if not exact else ()
+        for holders in ([each for each in bringing if each.demand == demand], exact, others):
+            found = []
+            for claim, route in self._bringing(holders, flow):
+                key, is_own = claim.connection.key_of(route), claim.demand == demand
+                was_listed = is_own and not route.implied
+                # from another node, only an earlier goal of the demand itself brings it
+                if key.sender != flow.sender and not (is_join and was_listed):
+                    continue
+                if key.topic != flow.topic and (flow.is_output or flow.delivery is not None):
+                    continue
+                # a put gives up what it listed and lists no longer
+                if key.topic != flow.topic and was_listed and not is_join:
+                    continue
+                found.append((key != same, claim.subject.id, claim, route))
+            if found:
+                *_, claim, route = min(found, key=lambda each: each[:2])
+                return claim, route
+        return None
 
-    def _bringing(self, flow: Flow) -> Iterator[tuple[Claim, Route]]:
-        for claim in self._ledger.claims_bringing(flow.receiver, flow.target):
+    def _bringing(self, holders: Iterable[ClaimKey], flow: Flow) -> Iterator[tuple[Claim, Route]]:
+        for claim in filter(None, map(self._ledger.get, sorted(holders, key=_order))):
             if claim.key not in self._by_target:
                 routes: dict[tuple[str, str], list[Route]] = {}
                 for route in claim.connection.topics:
@@ -128,6 +132,10 @@ class _StandingRoutes:
                 self._by_target[claim.key] = routes
             for route in self._by_target[claim.key].get((flow.receiver, flow.target), ()):
                 yield claim, route
+
+
+def _order(key: ClaimKey) -> tuple[str, str]:
+    return key.subject.id, key.demand
 
 
 # ---- carriers: each route of a demand gets its connection ----
@@ -219,7 +227,7 @@ class _Carriers:
             return self._above[key]
         if not own and is_bridged(key, self._config):
             return None
-        for each in sorted(own or holding, key=lambda each: (each.subject.id, each.demand))[:1]:
+        for each in sorted(own or holding, key=_order)[:1]:
             claim = self._ledger.get(each)
             route = claim.connection.route_of(key) if claim else None
             if claim and route:
@@ -248,8 +256,9 @@ class _Carriers:
         if kind is not None:
             id = kind.derived_id(key)
             other = self._header(id)
-            # other nodes, or a connection that somebody lists, may give the same id
-            if other and (other.type, other.nodes) != (kind, listed.nodes):
+            # a connection that somebody lists, or between other nodes, may have the same id
+            same = (kind, listed.nodes) if not kind.one_derived_route else None
+            if other and (other.type, other.nodes) != same:
                 id = f"derived/{hash_of(json.dumps([kind.word, *key]), 20)}"
         return replace(listed, id=id, type=kind)
 
