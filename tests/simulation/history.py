@@ -148,6 +148,8 @@ class History:
         if joins and self.chance.randrange(3):
             (item,), known = made["connections"], self.chance.choice(joins)
             who = {name: known["connections"][0][name] for name in ("id", "requester_ids")}
+            topics = [f"/{who['id']}{topic[-1]}" for topic in item["source_topics"]]
+            who |= {"source_topics": topics, "target_topics": topics}
             made |= {"id": known["id"], "connections": [item | who]}
         return made
 

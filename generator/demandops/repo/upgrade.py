@@ -16,9 +16,10 @@ from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput, StateRepoError, fault
 from demandops.base.runtime import REAL
 from demandops.base.settings import LEDGER_API_VERSION, RENDER_VERSION
+from demandops.decide.carriers import with_one_carrier
 from demandops.decide.changeset import planned_releases
 from demandops.decide.decision import faults_of_edit
-from demandops.decide.placement.relocation import update_ledger
+from demandops.decide.placement.relocation import changed_claim_files, update_ledger
 from demandops.decide.planning.flows import with_booked_topics_marked
 from demandops.decide.state import State
 from demandops.model.config.appdef import without_ignored_fields
@@ -131,6 +132,9 @@ def _plan(
     state = replace(state, ledger=applied.ledger)
     if old.repo_settings.render_version < _FIRST_WITH_MARKS:
         state = replace(state, ledger=with_booked_topics_marked(state.ledger, config))
+    ledger, keys = with_one_carrier(state.ledger)
+    state = replace(state, ledger=ledger)
+    changed_claims = changed_claim_files(applied.ledger, ledger, keys)
     if old.repo_settings.gitops != config.repo_settings.gitops:
         # a held file would stay rendered for the old controller
         held = [
@@ -147,12 +151,13 @@ def _plan(
         if held:
             raise InvalidInput(held)
     files_of_ledger = _in_this_schema(trees.texts(tree, (LEDGER_ROOT,)), state.ledger)
-    changed = dict(batch.render_all(state, {**files_of_ledger, **applied.files}).files)
+    written = {**files_of_ledger, **applied.files, **changed_claims}
+    changed = dict(batch.render_all(state, written).files)
     if last_valid_config.PATH in tree:  # the state is valid, or the upgrade is refused
         changed[last_valid_config.PATH] = None
     changed |= {path: text for path, text in by_people.items() if text != files[path]}
     upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))
-    return upgrade, batch, state, applied.keys
+    return upgrade, batch, state, (*applied.keys, *keys)
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str | None]:
