@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.errors import OverBudget, Refused
-from demandops.decide.decision import MOST_TRIALS, decide
+from demandops.decide.decision import decide
+from demandops.decide.placement.placement import MOST_ATTEMPTS
 
 from tests.kit.config import override, skeleton
 from tests.kit.goals import Goal, application, connection, goal, perception
@@ -118,7 +119,7 @@ DENIED = {"overrides/no.yaml": override({"nodes": [f"e{n:03}" for n in range(10)
 
 def test_trials_are_bounded_by_number_and_the_answer_has_the_first_refusal_too() -> None:
     books = repo(12, DENIED)
-    few = MOST_TRIALS // 11  # each application is denied on ten nodes and booked on the eleventh
+    few = MOST_ATTEMPTS // 11  # each application is denied on ten nodes and booked on the eleventh
     assert books.decide(demand(app(n, connect="none") for n in range(few))).outcome == "booked"
     refusal = books.take(demand(app(n, connect="none") for n in range(few + 2)))
     assert codes(refusal) == {"denied", "too-large"}

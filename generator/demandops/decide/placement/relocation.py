@@ -9,7 +9,7 @@ from functools import partial, reduce
 from itertools import islice
 from math import inf
 
-from demandops.base.errors import Fault, sentences
+from demandops.base.errors import Fault, Refused
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection, Route
@@ -17,9 +17,9 @@ from demandops.decide.admission import admission, permission
 from demandops.decide.booking import Drain, conflicts
 from demandops.decide.checks import collisions, quotas
 from demandops.decide.checks.collisions import Names
-from demandops.decide.placement import candidates
-from demandops.decide.placement.candidates import Choice, Chosen
-from demandops.decide.placement.capacity import Room, Usage
+from demandops.decide.placement import candidates, capacity
+from demandops.decide.placement.candidates import Choice, Chosen, Room
+from demandops.decide.placement.capacity import Need, Usage
 from demandops.decide.planning import overrides
 from demandops.decide.planning.flows import Flow, connection_for, flows
 from demandops.decide.planning.release_keys import affected_keys
@@ -124,14 +124,14 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
 def with_moves(
     request: Drain, world: World, usage: Usage, names: Names, most: float = inf
 ) -> Drain:
-    """Return ``request`` with the moves that are possible, after ``most`` tried nodes no more."""
+    """Return ``request`` with the moves that are possible, after ``most`` attempts no more."""
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
-    room, tried, last = Room(world, usage), 0, request.after
+    attempts, last = 0, request.after
     node = request.id
     for id in applications_of(world.ledger, node):
         if id <= request.after:
             continue
-        if tried >= most:
+        if attempts >= most:
             break
         last = id
         app = world.ledger.application(id)
@@ -149,30 +149,26 @@ def with_moves(
             claims = tuple(claim for id in ids for claim in world.ledger.application_claims(id))
             what = [f"application '{id}'" for id in ids]
             what = [f"service '{service.name}' of {text}" for text in what] if service else what
-            fixed = (_why_fixed(claim, node, service) for claim in claims)
-            outcome: _Moved | str = next(filter(None, fixed), "")
-            tried += 1
-            if not outcome:
-                outcome, count = _moved(world, claims, room, names, service)
-                tried += count
+            attempts += 1
             # What cannot move holds up nothing else.
-            if isinstance(outcome, str):
-                stays.append(f"{what[0]} stays, because {outcome}")
+            if fixed := next(filter(None, (_why_fixed(c, node, service) for c in claims)), ""):
+                stays.append(f"{what[0]} stays, because {fixed}")
                 continue
-            world, chosen, changed, names = outcome
-            # ``world`` has the application on its new node, so ``room`` must count it on this node
-            for moved_id in ids:
-                room.book(world.ledger.application_claims(moved_id))
-            keys += changed
-            moved += [f"{text} is placed on {quoted(chosen.node)}, {chosen.why}" for text in what]
+            choice = _choice_for(world, claims, service, usage)
+            try:
+                chosen, move = choice.first(_attempt_of(world, claims, service, usage, names))
+            except Refused as refusal:
+                stays.append(f"{what[0]} stays, because {refusal.faults[0].message}")
+            else:
+                world, names, usage = move.world, move.names, usage.plus(move.grown)
+                keys += [change.key for change in move.changes]
+                on = f"is placed on {quoted(chosen.node)}, {chosen.why}"
+                moved += [f"{text} {on}" for text in what]
+            attempts += len(choice.full) + len(choice.refused)
     else:
         last = ""
     moves = claim_changes(start.ledger, world.ledger, keys)
     return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays), last=last)
-
-
-# The world after a move, the chosen node, the keys of the changed claims, and the names after it.
-_Moved = tuple[World, Chosen, list[ClaimKey], Names]
 
 
 def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
@@ -211,21 +207,35 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
     return [id for id, app in apps if app and node in app.chosen_nodes]
 
 
-def _moved(
-    world: World, claims: tuple[Claim, ...], room: Room, names: Names, service: Service | None
-) -> tuple[_Moved | str, int]:
-    """Return the move to the best other node, or why there is none, and how many were tried."""
+def _choice_for(
+    world: World, claims: tuple[Claim, ...], service: Service | None, usage: Usage
+) -> Choice:
+    """Return the choice of another node, by what all the claims require and read."""
     places = (claim.application.place or Requirement() for claim in claims)
     required = candidates.requirement_of(service) if service else reduce(Requirement.united, places)
     inputs: dict[str, dict[InputTopic, None]] = {}
     for claim in claims:
         for role, topics in claim.application.inputs.items():
             inputs.setdefault(role, {}).update(dict.fromkeys(topics))
-    united = {role: tuple(topics) for role, topics in inputs.items()}
-    app = claims[0].application.with_inputs(united)
-    demanded = Item(app, requesters_of(claims))
-    choice = Choice(demanded, required, world, room, claims, service)
-    reasons: list[str] = []
+    app = claims[0].application.with_inputs({role: (*topics,) for role, topics in inputs.items()})
+    room = Room(world, usage, given_back=claims)
+    return Choice(Item(app, requesters_of(claims)), required, room, claims, service)
+
+
+@dataclass(frozen=True, slots=True)
+class _Move:
+    """A move of claims to other nodes: the world and the names after it, and what it changes."""
+
+    world: World
+    names: Names
+    changes: tuple[ClaimChange, ...]
+    grown: Mapping[Need, int]
+
+
+def _attempt_of(
+    world: World, claims: tuple[Claim, ...], service: Service | None, usage: Usage, names: Names
+) -> Callable[[Chosen], _Move]:
+    """Return the attempt to move claims to a node; it raises Refused if the move has a fault."""
     # On the sender's own node, no connection would rename the topic.
     renamed = {
         flow.sender: route
@@ -234,20 +244,25 @@ def _moved(
         for _, route in _carrying(world.ledger, claim.demand, flow)
         if flow.delivery is None and route.read_topic != route.written_topic
     }
-    for chosen in islice(choice.candidates(), candidates.MOST_TRIED):
-        if route := renamed.get(chosen.node):
-            problem = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
-            reasons.append(f"on {quoted(chosen.node)} {problem}")
-            continue
-        move = partial(candidates.on_node, node=chosen.node, service=service, world=world)
+
+    def attempt(chosen: Chosen) -> _Move:
+        node = chosen.node
+        if route := renamed.get(node):
+            message = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
+            raise Refused.at("", message)
+        move = partial(candidates.on_node, node=node, service=service, world=world)
         after, changes = with_moved(world, claims, move)
-        moved_names = collisions.followed(names, world, after, affected_keys(world, after, changes))
-        fault = next(_faults(world, after, changes, moved_names), None)
-        if fault is None:
-            keys = [change.key for change in changes]
-            return (after, chosen, keys, moved_names), len(reasons) + 1
-        reasons.append(f"on {quoted(chosen.node)} {fault.message}")
-    return sentences(reasons) or choice.none_fits().message, len(reasons)
+        keys = affected_keys(world, after, changes)
+        followed = collisions.followed(names, world, after, keys)
+        if faults := [*islice(_faults(world, after, changes, followed), 1)]:
+            raise Refused(faults)
+        grown = capacity.growth_by(world, after, changes)
+        host = world.config.host_of(node)
+        there = {need: amount for need, amount in grown.items() if need[0] == host}
+        capacity.refuse_excess(usage, there, world.config)
+        return _Move(after, followed, changes, grown)
+
+    return attempt
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from pygit2 import Blob, GitError, Oid, Repository, Tree
 from demandops.base.errors import Fault, InvalidInput, StateRepoError
 from demandops.base.naming import Subject
 from demandops.base.settings import GENERATED_ROOTS
-from demandops.decide.decision import changeset_of_edit, faults_of_edit
+from demandops.decide.edits import changeset_of_edit, faults_of_edit
 from demandops.decide.state import State, rendered_files
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.ledger import ClaimChange

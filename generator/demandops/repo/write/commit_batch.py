@@ -21,7 +21,8 @@ from demandops.base.quoting import one_line
 from demandops.base.settings import GENERATED_ROOTS
 from demandops.decide.booking import Drain
 from demandops.decide.changeset import Change, Changeset, ReleaseChange
-from demandops.decide.decision import Decision, changeset_of_edit, decide
+from demandops.decide.decision import Decision, decide
+from demandops.decide.edits import changeset_of_edit
 from demandops.decide.placement import relocation
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import NODES_FILE
