@@ -6,11 +6,9 @@ chosen if it fits. If it does not fit, the best other node that fits is chosen.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from heapq import nsmallest
 from math import fsum, inf
 from typing import TypeVar
@@ -89,28 +87,40 @@ class Room:
         given_back: Iterable[Claim] = (),
         booked: Iterable[Claim] = (),
     ) -> None:
-        self.start, self._usage = start, usage
+        self.start, self._usage, self._world = start, usage, start
         self._given_back, self._booked = tuple(given_back), tuple(booked)
+        self._taken = list[tuple[Choice, str]]()
 
-    @cached_property
+    @property
     def world(self) -> World:
-        ledger = self.start.ledger.without(self._given_back)
-        for claim in self._booked:
-            ledger = ledger.replace(claim.key, claim)
-        return replace(self.start, ledger=ledger)
+        self._count()
+        return self._world
 
-    @cached_property
+    @property
     def usage(self) -> Usage:
-        keys = [claim.key for claim in (*self._given_back, *self._booked)]
-        changes = claim_changes(self.start.ledger, self.world.ledger, keys)
-        with suppress(Refused):  # admission reports why an application cannot run
-            return self._usage.plus(capacity.growth_by(self.start, self.world, changes))
+        self._count()
         return self._usage
 
-    def take(self, claims: Iterable[Claim], growth: Mapping[Need, int]) -> None:
-        self.usage = self.usage.plus(growth)
-        for claim in claims:
-            self.world = replace(self.world, ledger=self.world.ledger.replace(claim.key, claim))
+    def take(self, choice: Choice, node: str) -> None:
+        self._taken.append((choice, node))
+
+    def _count(self) -> None:
+        # Only when it is asked for: most demands that come again need no other node.
+        if changed := (*self._given_back, *self._booked):
+            ledger = self._world.ledger.without(self._given_back)
+            for claim in self._booked:
+                ledger = ledger.replace(claim.key, claim)
+            self._given_back = self._booked = ()
+            changes = claim_changes(self.start.ledger, ledger, [claim.key for claim in changed])
+            self._world = replace(self.start, ledger=ledger)
+            with suppress(Refused):  # admission reports why an application cannot run
+                self._usage = self._usage.plus(capacity.growth_by(self.start, self._world, changes))
+        while self._taken:
+            choice, node = self._taken.pop(0)
+            self._usage = self._usage.plus(choice.growth(node))
+            for claim in choice.claims_on(node):
+                ledger = self._world.ledger.replace(claim.key, claim)
+                self._world = replace(self._world, ledger=ledger)
 
 
 @dataclass(slots=True)
@@ -131,7 +141,7 @@ class Choice:
     # Why nodes were tried in vain: what they have too little of, or what was refused there
     full: dict[str, list[str]] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
-    _starting: list[tuple[ServiceKey, Mapping[Need, int]]] | None = None
+    _starting: list[tuple[ServiceKey, dict[str, int]]] | None = None
 
     @property
     def config(self) -> Config:
@@ -217,6 +227,7 @@ class Choice:
         if not self.config.limits_capacity:
             return {}
         varies = any(each.node or each.replicas is not None for each in self.room.start.overrides)
+        # The same on each node, so it is planned only once, unless an override may change it there
         if self._starting is None or varies:
             self._starting = []
             claims, after = self.claims_on(node), self.room.world
@@ -231,15 +242,15 @@ class Choice:
                         and not services[key.service].at_source
                         and (self.service is None or key.service == self.service.name)
                     ):
-                        requests = capacity.requests({key: plan(after, key)}, self.config)
-                        self._starting.append((key, requests))
-        # The same on each node, so it is planned only once, unless an override may change it there
-        host, total = self.config.host_of(node), Counter[Need]()
-        for key, requests in self._starting:
+                        needs = capacity.requests({key: plan(after, key)}, self.config).items()
+                        amounts = {resource: amount for (_, resource), amount in needs}
+                        self._starting += [(key, amounts)] if amounts else []
+        host, total = self.config.host_of(node), dict[Need, int]()
+        for key, amounts in self._starting:
             if key.application or not is_needed(self.room.world, replace(key, node=node)):
-                for (_, resource), amount in requests.items():
-                    total[host, resource] += amount
-        return dict(total)
+                for resource, amount in amounts.items():
+                    total[host, resource] = total.get((host, resource), 0) + amount
+        return total
 
     def claims_on(self, node: str) -> list[Claim]:
         return [
@@ -252,10 +263,16 @@ class Choice:
         traits = (*((name,) for name in required.capabilities), *required.label_pairs)
         # Of the nodes with each required trait, only the shortest list is searched.
         pools = [config.nodes_with.get(trait, ()) for trait in traits]
-        return [
+        pool = min((config.nodes_by_role.get(required.role, ()), *pools), key=len)
+        role, labels, capabilities = required.role, required.label_pairs, required.capabilities
+        return [  # there may be thousands, so what is cheap to see comes first
             node
-            for node in min((config.nodes_by_role.get(required.role, ()), *pools), key=len)
-            if not self._closed(node) and not any(lacks(node, required))
+            for node in pool
+            if not node.drained
+            and node.id in config.domain_of
+            and (not role or node.type == role)
+            and all(capability in node.capabilities for capability in capabilities)
+            and not ((labels or required.properties) and any(lacks(node, required)))
         ]
 
     def _is_full(self, node: Node) -> bool:
@@ -285,15 +302,17 @@ class Choice:
         is_service = self.service is not None
 
         def rank(node: Node) -> tuple[bool, float, float, str]:
-            at = (node.position or positions.get(node.id)) if placed else None
+            id, at = node.id, node.position
+            if at is None and positions:
+                at = positions.get(id)
             # Squared, because every machine computes this alike.
-            distance = (at.x - x) ** 2 + (at.y - y) ** 2 if at else inf
-            booked = applications_on.get(node.id) or 0
-            away = not (is_service and node.id == home)
+            distance = (at.x - x) ** 2 + (at.y - y) ** 2 if at and placed else inf
+            booked = applications_on.get(id) or 0
+            away = not (is_service and id == home)
             # The id comes last, so that every generator and every replay chooses the same node.
             if order == "nearest":
-                return away, distance, booked, node.id
-            return away, -booked if order == "pack" else booked, distance, node.id
+                return away, distance, booked, id
+            return away, -booked if order == "pack" else booked, distance, id
 
         return rank
 

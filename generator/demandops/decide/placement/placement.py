@@ -7,7 +7,8 @@ alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Generic, TypeVar
@@ -135,7 +136,7 @@ class _Search(Generic[_Result]):
         on_named_nodes = [
             _claim(request, item)
             for item in request.demanded
-            if isinstance(item.held, Application) and item.held.place is None
+            if isinstance(item.held, Application) and item.held.node
         ]
         own = (*ledger.claims_of_demand(request.demand), *kept)
         return Room(self._state, self._state.usage(), own, on_named_nodes)
@@ -147,16 +148,26 @@ class _Search(Generic[_Result]):
         comes later. Services come after all applications, because a service runs on its
         application's node if it can.
         """
-        for place in (self._place_application, self._place_services):
-            for index, item in enumerate(self._demanded):
-                if isinstance(item.held, Application):
-                    try:
-                        place(index, item, item.held)
-                    except Refused as refusal:
-                        if self._one_by_one:
-                            raise
-                        self._faults += refusal.faults
+        for index, item in enumerate(self._demanded):
+            if isinstance(item.held, Application) and item.held.place is not None:
+                with self._faults_noted():
+                    self._place_application(index, item, item.held, item.held.place)
+        for index, item in enumerate(self._demanded):
+            if isinstance(item.held, Application) and item.held.node:
+                for service in self._services_left(index, item, item.held):
+                    with self._faults_noted():
+                        self._place_service(index, service)
         return replace(self._request, demanded=tuple(self._demanded)), self._faults
+
+    @contextmanager
+    def _faults_noted(self) -> Iterator[None]:
+        self._checkpoint()
+        try:
+            yield
+        except Refused as refusal:
+            if self._one_by_one:
+                raise
+            self._faults += refusal.faults
 
     def one_by_one(self) -> _Result:
         """Return what the attempt returns for nodes that are attempted one after another."""
@@ -176,36 +187,28 @@ class _Search(Generic[_Result]):
             return self._last[1]
         return self._tried(request.demanded)
 
-    def _place_application(self, index: int, item: Item, app: Application) -> None:
-        if app.place is None:
-            return
-        self._checkpoint()
+    def _place_application(
+        self, index: int, item: Item, app: Application, place: Requirement
+    ) -> None:
+        choice = self._choice(item, place)
         if app.node:
             # ``node`` and ``place`` together are a check of the named node, and no preference.
-            node = self._state.config.nodes.get(app.node)
+            node = choice.config.nodes.get(app.node)
             # admission reports an unknown node
-            if node and (lacking := list(lacks(node, app.place))):
+            if node and (lacking := list(lacks(node, place))):
                 message = (
                     f"{quoted(app.node)} lacks {joined(lacking)}; name another node, or leave out "
                     "one of the fields 'node' and 'place'"
                 )
                 raise Refused([item.fault("place", message, code="no-node")])
-            item = replace(item, held=replace(app, place=None))
-            self._demanded[index] = item
-            self._room.take([_claim(self._request, item)], {})
+            self._demanded[index] = replace(item, held=replace(app, place=None))
             return
-        choice = self._choice(item, app.place)
-        chosen = _booked(choice, self._request.demand)
-        if chosen is None:
-            chosen = self._first(index, choice)
-        self._take(index, choice, chosen)
+        self._take(index, choice, _booked(choice, self._request.demand))
 
-    def _place_services(self, index: int, item: Item, app: Application) -> None:
-        if not app.node:
-            return
-        self._checkpoint()
+    def _services_left(self, index: int, item: Item, app: Application) -> list[Service]:
+        """Return the services that still need a node; those that are named or booked get theirs."""
         request, ledger, config = self._request, self._state.ledger, self._state.config
-        claims, faults = ledger.claims_on(app.subject), list[Fault]()
+        claims = ledger.claims_on(app.subject)
         first = claims[0].application if claims else None
         if first and first.appdef != app.appdef:
             first = None
@@ -220,17 +223,14 @@ class _Search(Generic[_Result]):
                         f"{', '.join(claims[0].requesters)}: service {name} of '{app.id}' is on "
                         f"node '{node}'; name node '{node}', or use another application id"
                     )
-                    faults.append(item.fault(f"services.{name}", message, code="conflict"))
+                    self._faults.append(item.fault(f"services.{name}", message, code="conflict"))
             # A service that the claim does not place runs with its application. To name that node
             # changes nothing, and is not recorded, because all claims on an application say the
             # same.
             named = tuple(name for name in app.named if name in first.services)
-            item = replace(item, held=replace(app, services=first.services, named=named))
-            self._demanded[index] = item
-            self._room.take([_claim(request, item)], {})
-            if faults:
-                raise Refused(faults)
-            return
+            held = replace(app, services=first.services, named=named)
+            self._demanded[index] = replace(item, held=held)
+            return []
         services = config.services.get(app.appdef, {})
         for name in app.named:
             wanted, definition = config.nodes.get(app.services[name]), services.get(name)
@@ -240,7 +240,7 @@ class _Search(Generic[_Result]):
                     f"('place' in {definition.file}); name another node, or name none for this "
                     "service"
                 )
-                faults.append(item.fault(f"services.{name}", message, code="no-node"))
+                self._faults.append(item.fault(f"services.{name}", message, code="no-node"))
         # A node that the demand named for a service and names no longer does not stay.
         no_longer_named = {
             name
@@ -248,28 +248,24 @@ class _Search(Generic[_Result]):
             if claim.demand == request.demand
             for name in claim.application.named
         }
-        stay = {*services} - {*app.named} - no_longer_named
+        stay = {*services} - {*app.services} - no_longer_named
         booked = first.services if first else {}
         kept = {name: node for name, node in booked.items() if name in stay}
-        self._demanded[index] = replace(item, held=replace(app, services={**app.services, **kept}))
-        for service in _services_to_place(app, self._state):
-            choice = self._choice(self._demanded[index], requirement_of(service), service)
-            here, shared = booked.get(service.name, ""), _shared_node(app, service, self._state)
-            try:
-                if here and (here == shared or choice.fits(here)):
-                    chosen = Chosen(here, "where it is booked already")
-                elif shared and choice.has_room(shared):
-                    chosen = Chosen(shared, "where the service already runs for this topic")
-                else:
-                    chosen = self._first(index, choice)
-            except Refused as refusal:
-                if self._one_by_one:
-                    raise
-                faults += refusal.faults
-                continue
-            self._take(index, choice, chosen)
-        if faults:
-            raise Refused(faults)
+        self._demanded[index] = replace(item, held=replace(app, services=kept | {**app.services}))
+        return _services_to_place(app, self._state)
+
+    def _place_service(self, index: int, service: Service) -> None:
+        choice = self._choice(self._demanded[index], requirement_of(service), service)
+        first = self._state.ledger.application(choice.app.id)
+        is_same = first is not None and first.appdef == choice.app.appdef
+        here = first.services.get(service.name, "") if first and is_same else ""
+        shared = _shared_node(choice.app, service, self._state)
+        chosen = None
+        if here and (here == shared or choice.fits(here)):
+            chosen = Chosen(here, "where it is booked already")
+        elif shared and choice.has_room(shared):
+            chosen = Chosen(shared, "where the service already runs for this topic")
+        self._take(index, choice, chosen)
 
     def _choice(
         self, item: Item, requirement: Requirement, service: Service | None = None
@@ -277,7 +273,9 @@ class _Search(Generic[_Result]):
         claims, positions = (_claim(self._request, item),), self._request.positions
         return Choice(item, requirement, self._room, claims, service, positions)
 
-    def _first(self, index: int, choice: Choice) -> Chosen:
+    def _take(self, index: int, choice: Choice, chosen: Chosen | None) -> None:
+        """Put the application or service on ``chosen``, or else on the first node that will do."""
+
         def attempt(chosen: Chosen) -> None:
             if self._one_by_one:
                 demanded = [*self._demanded]
@@ -290,11 +288,9 @@ class _Search(Generic[_Result]):
                 )
                 self._last = placed, self._tried(placed)
 
-        return choice.first(attempt)[0]
-
-    def _take(self, index: int, choice: Choice, chosen: Chosen) -> None:
+        chosen = chosen or choice.first(attempt)[0]
         self._demanded[index] = choice.on(chosen)
-        self._room.take(choice.claims_on(chosen.node), choice.growth(chosen.node))
+        self._room.take(choice, chosen.node)
 
     def _tried(self, demanded: tuple[Item, ...]) -> _Result:
         request = replace(self._request, demanded=demanded)
