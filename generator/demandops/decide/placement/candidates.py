@@ -6,8 +6,8 @@ chosen if it fits. If it does not fit, the best other node that fits is chosen.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from heapq import nsmallest
 from math import fsum, inf
@@ -19,16 +19,15 @@ from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
 from demandops.decide.placement import capacity
 from demandops.decide.placement.capacity import Need, NoRoom, Usage
+from demandops.decide.planning.flows import instances
 from demandops.decide.planning.overrides import with_overridden_nodes
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import is_needed, keys_of_claims
+from demandops.decide.planning.release_keys import is_needed
 from demandops.model.config import inventory
 from demandops.model.config.appdef import Place, Service
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
-from demandops.model.config.inventory import Node, Position
+from demandops.model.config.inventory import Node, Position, amount_of
 from demandops.model.demand.demand import Application, Item, Requirement
-from demandops.model.ledger.claim import Claim
-from demandops.model.ledger.ledger import World, claim_changes
+from demandops.model.ledger.ledger import World
 from demandops.model.release import ServiceKey
 
 _MOST_SHOWN = 5
@@ -73,79 +72,40 @@ def shares(service: Service, app: Application, other: Application) -> bool:
     return service.scope == "topic" and identity == (other.appdef, other.node, other.own_version)
 
 
+@dataclass(slots=True)
 class Room:
-    """What nodes have left while the applications of a demand are placed one after another.
+    """What is left while the applications of a demand are placed one after another.
 
-    ``start`` is the world before the demand. The claims in ``given_back`` count as released, those
-    in ``booked`` as booked. It is a filter: the decision counts exactly.
+    It only rules out nodes that are certainly full. The decision counts exactly.
     """
 
-    def __init__(
-        self,
-        start: World,
-        usage: Usage,
-        given_back: Iterable[Claim] = (),
-        booked: Iterable[Claim] = (),
-    ) -> None:
-        self.start, self._usage, self._world = start, usage, start
-        self._given_back, self._booked = tuple(given_back), tuple(booked)
-        self._taken = list[tuple[Choice, str]]()
-
-    @property
-    def world(self) -> World:
-        self._count()
-        return self._world
-
-    @property
-    def usage(self) -> Usage:
-        self._count()
-        return self._usage
-
-    def take(self, choice: Choice, node: str) -> None:
-        self._taken.append((choice, node))
-
-    def _count(self) -> None:
-        # Only when it is asked for: most demands that come again need no other node.
-        if changed := (*self._given_back, *self._booked):
-            ledger = self._world.ledger.without(self._given_back)
-            for claim in self._booked:
-                ledger = ledger.replace(claim.key, claim)
-            self._given_back = self._booked = ()
-            changes = claim_changes(self.start.ledger, ledger, [claim.key for claim in changed])
-            self._world = replace(self.start, ledger=ledger)
-            with suppress(Refused):  # admission reports why an application cannot run
-                self._usage = self._usage.plus(capacity.growth_by(self.start, self._world, changes))
-        while self._taken:
-            choice, node = self._taken.pop(0)
-            self._usage = self._usage.plus(choice.growth(node))
-            for claim in choice.claims_on(node):
-                ledger = self._world.ledger.replace(claim.key, claim)
-                self._world = replace(self._world, ledger=ledger)
+    world: World
+    usage: Usage
+    # The nodes on which a demand gives something back itself are not ruled out.
+    given_back: Collection[str] = ()
+    # What was placed so far: the instances that begin to run, and how many at each node
+    started: set[ServiceKey] = field(default_factory=set)
+    placed: Counter[str] = field(default_factory=Counter)
 
 
 @dataclass(slots=True)
 class Choice:
-    """The choice of a node for one application, or for one of its services.
-
-    ``claims`` are those that the application would get, and ``room`` is without them; the chosen
-    node replaces the node in them.
-    """
+    """The choice of a node for one application, or for one of its services."""
 
     item: Item
     requirement: Requirement
     room: Room
-    claims: tuple[Claim, ...]
     service: Service | None = None
     # Those that the demand gives, by node id. A position in the inventory has precedence.
     positions: Mapping[str, Position] = field(default_factory=dict)
     # Why nodes were tried in vain: what they have too little of, or what was refused there
     full: dict[str, list[str]] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
-    _starting: list[tuple[ServiceKey, dict[str, int]]] | None = None
+    _starting: list[ServiceKey] | None = None
 
     @property
     def config(self) -> Config:
-        return self.room.start.config
+        return self.room.world.config
 
     @property
     def app(self) -> Application:
@@ -157,7 +117,7 @@ class Choice:
         what = f"application '{self.app.id}'"
         what = f"service '{self.service.name}' of {what}" if self.service else what
         placed = f"{what} is placed on {quoted(chosen.node)}, {chosen.why}"
-        held = on_node(self.app, chosen.node, self.service, self.room.start)
+        held = on_node(self.app, chosen.node, self.service, self.room.world)
         return replace(self.item, held=held, placed=(*self.item.placed, placed))
 
     def first(self, attempt: Callable[[Chosen], _Result]) -> tuple[Chosen, _Result]:
@@ -194,7 +154,7 @@ class Choice:
         order = self.config.repo_settings.placement
         skipped: dict[str, None] = {}
         for node in sorted(fitting, key=rank):
-            if self._is_full(node):
+            if self._shortage(node):
                 skipped["that have room"] = None
                 continue
             if not self._is_permitted(node):
@@ -217,46 +177,53 @@ class Choice:
 
     def has_room(self, node: str) -> bool:
         entry = self.config.nodes.get(node)
-        return entry is not None and self.fits(node) and not self._is_full(entry)
+        return entry is not None and self.fits(node) and not self._shortage(entry)
 
-    def growth(self, node: str) -> dict[Need, int]:
-        """Return what those services request that would begin to run on ``node``.
+    def take(self, node: str) -> None:
+        growth = self._growth(node)
+        self.room.usage = self.room.usage.plus(self._amounts(node, growth))
+        self.room.started |= {*growth}
+        self.room.placed[node] += 1
 
-        It is the least that the demand needs there, because services that run already may grow.
-        """
-        if not self.config.limits_capacity:
+    def _growth(self, node: str) -> list[ServiceKey]:
+        """Return the instances that would begin to run on ``node`` and request something there."""
+        world, services = self.room.world, self.config.services.get(self.app.appdef, {})
+        # The same on each node, so it is found only once, unless an override may move a service
+        if self._starting is None or any(override.node for override in world.overrides):
+            app = on_node(self.app, node, self.service, world)
+            self._starting = [
+                key
+                for service in services.values()
+                if service.requests and not service.at_source and not service.nodes
+                if self.service in (None, service)
+                for key in instances(app, service)
+                if key.node == node
+            ]
+        keys = (replace(key, node=node) for key in self._starting)
+        return [
+            key
+            for key in keys
+            if key not in self.room.started and (key.application or not is_needed(world, key))
+        ]
+
+    def _amounts(self, node: str, keys: Iterable[ServiceKey]) -> dict[Need, int]:
+        """Return what the instances request at least: each has one replica or more."""
+        if any(override.replicas == 0 for override in self.room.world.overrides):
             return {}
-        varies = any(each.node or each.replicas is not None for each in self.room.start.overrides)
-        # The same on each node, so it is planned only once, unless an override may change it there
-        if self._starting is None or varies:
-            self._starting = []
-            claims, after = self.claims_on(node), self.room.world
-            for claim in claims:
-                after = replace(after, ledger=after.ledger.replace(claim.key, claim))
-            services = self.config.services.get(self.app.appdef, {})
-            with suppress(Refused):  # admission reports why the application cannot run
-                for key in keys_of_claims(after, claims):
-                    if (
-                        isinstance(key, ServiceKey)
-                        and key.node == node
-                        and not services[key.service].at_source
-                        and (self.service is None or key.service == self.service.name)
-                    ):
-                        needs = capacity.requests({key: plan(after, key)}, self.config).items()
-                        amounts = {resource: amount for (_, resource), amount in needs}
-                        self._starting += [(key, amounts)] if amounts else []
         host, total = self.config.host_of(node), dict[Need, int]()
-        for key, amounts in self._starting:
-            if key.application or not is_needed(self.room.world, replace(key, node=node)):
-                for resource, amount in amounts.items():
-                    total[host, resource] = total.get((host, resource), 0) + amount
+        services = self.config.services.get(self.app.appdef, {})
+        for key in keys:
+            for resource, quantity in services[key.service].requests.items():
+                need = (host, resource)
+                total[need] = total.get(need, 0) + amount_of(quantity)
         return total
 
-    def claims_on(self, node: str) -> list[Claim]:
-        return [
-            replace(claim, held=on_node(claim.application, node, self.service, self.room.start))
-            for claim in self.claims
-        ]
+    def _shortage(self, node: Node) -> list[str]:
+        """Return, in words, each resource of which a node has too little; empty if it has room."""
+        if node.capacity is None or node.id in self.room.given_back:
+            return []
+        least = self._amounts(node.id, self._growth(node.id))
+        return [excess for _, excess in capacity.excesses(self.room.usage, least, self.config)]
 
     def _fitting(self) -> list[Node]:
         required, config = self.requirement, self.config
@@ -275,13 +242,6 @@ class Choice:
             and not ((labels or required.properties) and any(lacks(node, required)))
         ]
 
-    def _is_full(self, node: Node) -> bool:
-        return node.capacity is not None and any(
-            most is not None and self.room.usage.of(host, resource) + amount > most
-            for (host, resource), amount in self.growth(node.id).items()
-            for most in [node.most(resource)]
-        )
-
     def _is_home(self, node: Node) -> bool:
         # A service on its application's node needs no connection to it.
         return self.service is not None and node.id == self.app.node
@@ -298,7 +258,8 @@ class Choice:
             if (at := (node.position if node else None) or positions.get(source))
         ]
         x, y = (fsum(getattr(at, axis) for at in placed) / (len(placed) or 1) for axis in "xy")
-        applications_on, home = self.room.world.ledger.applications_on, self.app.node
+        applications_on, placed_on = self.room.world.ledger.applications_on, self.room.placed
+        home = self.app.node
         is_service = self.service is not None
 
         def rank(node: Node) -> tuple[bool, float, float, str]:
@@ -307,7 +268,7 @@ class Choice:
                 at = positions.get(id)
             # Squared, because every machine computes this alike.
             distance = (at.x - x) ** 2 + (at.y - y) ** 2 if at and placed else inf
-            booked = applications_on.get(id) or 0
+            booked = (applications_on.get(id) or 0) + placed_on[id]
             away = not (is_service and id == home)
             # The id comes last, so that every generator and every replay chooses the same node.
             if order == "nearest":
@@ -357,13 +318,6 @@ class Choice:
         less = f"change 'place' in {self.service.file}" if self.service else "ask for less"
         message += f"; {less}, or ask for a change of {' or '.join(places)}"
         return self._fault(message, code)
-
-    def _shortage(self, node: Node) -> list[str]:
-        """Return, in words, each resource of which a node has too little; empty if it has room."""
-        return [
-            excess
-            for _, excess in capacity.excesses(self.room.usage, self.growth(node.id), self.config)
-        ]
 
     def _fault(self, message: str, code: str) -> Fault:
         if self.service is None:

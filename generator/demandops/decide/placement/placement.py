@@ -30,12 +30,10 @@ from demandops.decide.placement.capacity import NoRoom, Usage
 from demandops.decide.state import State
 from demandops.model.config.appdef import Service
 from demandops.model.demand.demand import Application, Demand, Item, Requirement
-from demandops.model.ledger.claim import Claim, demand_id
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World
 
-# The booking time of a claim that is not booked yet. It is later than any other booking time, as
-# that of a new claim is, so ``merge: latest`` takes its parameters.
-_LAST = datetime.max.replace(tzinfo=timezone.utc)
+_NEVER = datetime.max.replace(tzinfo=timezone.utc)
 
 _Result = TypeVar("_Result")
 
@@ -131,15 +129,14 @@ class _Search(Generic[_Result]):
         self._last: tuple[tuple[Item, ...], _Result] | None = None
 
     def _whole_room(self) -> Room:
-        request, ledger = self._request, self._state.ledger
-        kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
-        on_named_nodes = [
-            _claim(request, item)
-            for item in request.demanded
-            if isinstance(item.held, Application) and item.held.node
-        ]
-        own = (*ledger.claims_of_demand(request.demand), *kept)
-        return Room(self._state, self._state.usage(), own, on_named_nodes)
+        request, state = self._request, self._state
+        own = list(state.ledger.claims_of_demand(request.demand))
+        own += (c for subject in request.subjects() for c in state.ledger.kept_claims(subject))
+        nodes = {node for c in own if c.is_on_application for node in c.application.needed_nodes()}
+        room = Room(state, state.usage(), nodes)
+        apps = (item.held for item in request.demanded if isinstance(item.held, Application))
+        room.placed.update(app.node for app in apps if app.node)
+        return room
 
     def placed(self) -> tuple[Demand, list[Fault]]:
         """Return the request with the best node for each application and service, and the faults.
@@ -270,8 +267,7 @@ class _Search(Generic[_Result]):
     def _choice(
         self, item: Item, requirement: Requirement, service: Service | None = None
     ) -> Choice:
-        claims, positions = (_claim(self._request, item),), self._request.positions
-        return Choice(item, requirement, self._room, claims, service, positions)
+        return Choice(item, requirement, self._room, service, self._request.positions)
 
     def _take(self, index: int, choice: Choice, chosen: Chosen | None) -> None:
         """Put the application or service on ``chosen``, or else on the first node that will do."""
@@ -290,7 +286,7 @@ class _Search(Generic[_Result]):
 
         chosen = chosen or choice.first(attempt)[0]
         self._demanded[index] = choice.on(chosen)
-        self._room.take(choice, chosen.node)
+        choice.take(chosen.node)
 
     def _tried(self, demanded: tuple[Item, ...]) -> _Result:
         request = replace(self._request, demanded=demanded)
@@ -314,30 +310,24 @@ def may_wait(request: Demand, state: State, checkpoint: Callable[[], None]) -> b
         app = item.held
         if not isinstance(app, Application):
             continue
-        room, claims = Room(state, Usage()), (_claim(request, item),)
-        choices = list[Choice]()
+        room, choices = Room(state, Usage()), list[Choice]()
         if app.place and not app.node:
-            choices.append(Choice(item, app.place, room, claims))
+            choices.append(Choice(item, app.place, room))
         for service in _services_to_place(app, state):
-            choices.append(Choice(item, requirement_of(service), room, claims, service))
+            choices.append(Choice(item, requirement_of(service), room, service))
         for choice in choices:
             checkpoint()
             for node in choice.nodes():
                 if state.config.domain_of[node].when_full == "wait":
-                    changes = [(None, claim) for claim in choice.claims_on(node)]
+                    held = candidates.on_node(app, node, choice.service, state).booked()
+                    claim = Claim(held, request.demand, request.id, item.requesters, _NEVER)
                     # A person approves only what can be booked at once, so what needs approval
                     # cannot wait.
-                    if not permission.approval_reasons(request, changes, state.config):
+                    if not permission.approval_reasons(request, [(None, claim)], state.config):
                         break
             else:
                 return False
     return True
-
-
-def _claim(request: Demand, item: Item) -> Claim:
-    """Return the claim that a demanded application would get if it were booked last of all."""
-    demand = request.demand or demand_id(request.id, item.requesters)
-    return Claim(item.held.booked(), demand, request.id, item.requesters, _LAST)
 
 
 def _shared_node(app: Application, service: Service, world: World) -> str:
@@ -356,7 +346,7 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
 
 def _booked(choice: Choice, demand: str) -> Chosen | None:
     """Return the booked node if it stays; raise Refused if it must but lacks something."""
-    app, claims = choice.app, choice.room.start.ledger.claims_on(choice.app.subject)
+    app, claims = choice.app, choice.room.world.ledger.claims_on(choice.app.subject)
     if not claims:
         return None
     id = claims[0].application.node

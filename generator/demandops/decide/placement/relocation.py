@@ -218,8 +218,7 @@ def _choice_for(
         for role, topics in claim.application.inputs.items():
             inputs.setdefault(role, {}).update(dict.fromkeys(topics))
     app = claims[0].application.with_inputs({role: (*topics,) for role, topics in inputs.items()})
-    room = Room(world, usage, given_back=claims)
-    return Choice(Item(app, requesters_of(claims)), required, room, claims, service)
+    return Choice(Item(app, requesters_of(claims)), required, Room(world, usage), service)
 
 
 @dataclass(frozen=True, slots=True)
