@@ -7,7 +7,7 @@ chosen if it fits. If it does not fit, the best other node that fits is chosen.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from heapq import nsmallest
 from math import fsum, inf
@@ -98,10 +98,9 @@ class Choice:
     service: Service | None = None
     # Those that the demand gives, by node id. A position in the inventory has precedence.
     positions: Mapping[str, Position] = field(default_factory=dict)
-    # Why nodes were tried in vain: what they have too little of, or what was refused there
-    full: dict[str, list[str]] = field(default_factory=dict)
-    refused: dict[str, str] = field(default_factory=dict)
-    _starting: list[ServiceKey] | None = None
+    # The refusals on nodes that were tried in vain
+    refused: dict[str, Refused] = field(default_factory=dict)
+    _starting: dict[ServiceKey, dict[str, int]] | None = None
 
     @property
     def config(self) -> Config:
@@ -128,15 +127,9 @@ class Choice:
         for chosen in self.candidates():
             try:
                 return chosen, attempt(chosen)
-            except NoRoom as refusal:
-                host = self.config.host_of(chosen.node)
-                if host in refusal.full:
-                    self.full[chosen.node] = refusal.full[host]
-                else:
-                    self.refused[chosen.node] = refusal.faults[0].message
             except Refused as refusal:
-                self.refused[chosen.node] = refusal.faults[0].message
-            if len(self.full) + len(self.refused) == MOST_TRIED:
+                self.refused[chosen.node] = refusal
+            if len(self.refused) == MOST_TRIED:
                 break
         raise Refused([self.none_fits()])
 
@@ -168,8 +161,8 @@ class Choice:
             only = f", counting only nodes {' and '.join(skipped)}" if skipped else ""
             why = f"{merit} among {len(fitting)} nodes that fit{only}"
             yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
-            was = "that have room" if node.id in self.full else "on which the demand can be booked"
-            skipped[was] = None
+            full = self._shortage(node)  # as the decision counted on the node
+            skipped["that have room" if full else "on which the demand can be booked"] = None
 
     def nodes(self) -> list[str]:
         # The full ones count too.
@@ -180,50 +173,46 @@ class Choice:
         return entry is not None and self.fits(node) and not self._shortage(entry)
 
     def take(self, node: str) -> None:
-        growth = self._growth(node)
-        self.room.usage = self.room.usage.plus(self._amounts(node, growth))
-        self.room.started |= {*growth}
+        """Count the application or service on a node, for the choices that follow."""
+        self.room.usage = self.room.usage.plus(self._growth(node))
+        self.room.started |= {replace(key, node=node) for key in self._starting or ()}
         self.room.placed[node] += 1
 
-    def _growth(self, node: str) -> list[ServiceKey]:
-        """Return the instances that would begin to run on ``node`` and request something there."""
-        world, services = self.room.world, self.config.services.get(self.app.appdef, {})
+    def _growth(self, node: str) -> dict[Need, int]:
+        """Return what the instances that would begin to run on ``node`` request at least."""
+        world, host = self.room.world, self.config.host_of(node)
         # The same on each node, so it is found only once, unless an override may move a service
         if self._starting is None or any(override.node for override in world.overrides):
             app = on_node(self.app, node, self.service, world)
-            self._starting = [
-                key
-                for service in services.values()
-                if service.requests and not service.at_source and not service.nodes
+            # Each has one replica or more, unless an override stops some.
+            stops = any(override.replicas == 0 for override in world.overrides)
+            self._starting = {
+                key: {name: amount_of(quantity) for name, quantity in service.requests.items()}
+                for service in self.config.services.get(app.appdef, {}).values()
+                if service.requests and not service.at_source and not service.nodes and not stops
                 if self.service in (None, service)
                 for key in instances(app, service)
                 if key.node == node
-            ]
-        keys = (replace(key, node=node) for key in self._starting)
-        return [
-            key
-            for key in keys
-            if key not in self.room.started and (key.application or not is_needed(world, key))
-        ]
-
-    def _amounts(self, node: str, keys: Iterable[ServiceKey]) -> dict[Need, int]:
-        """Return what the instances request at least: each has one replica or more."""
-        if any(override.replicas == 0 for override in self.room.world.overrides):
-            return {}
-        host, total = self.config.host_of(node), dict[Need, int]()
-        services = self.config.services.get(self.app.appdef, {})
-        for key in keys:
-            for resource, quantity in services[key.service].requests.items():
-                need = (host, resource)
-                total[need] = total.get(need, 0) + amount_of(quantity)
-        return total
+            }
+        growth = dict[Need, int]()
+        for key, amounts in self._starting.items():
+            shared = None if key.application else replace(key, node=node)
+            if shared and (shared in self.room.started or is_needed(world, shared)):
+                continue
+            for resource, amount in amounts.items():
+                growth[host, resource] = growth.get((host, resource), 0) + amount
+        return growth
 
     def _shortage(self, node: Node) -> list[str]:
         """Return, in words, each resource of which a node has too little; empty if it has room."""
+        refusal = self.refused.get(node.id)
+        if refusal is not None:
+            full = refusal.full if isinstance(refusal, NoRoom) else {}
+            return full.get(self.config.host_of(node.id), [])
         if node.capacity is None or node.id in self.room.given_back:
             return []
-        least = self._amounts(node.id, self._growth(node.id))
-        return [excess for _, excess in capacity.excesses(self.room.usage, least, self.config)]
+        growth, config = self._growth(node.id), self.config
+        return [excess for _, excess in capacity.excesses(self.room.usage, growth, config)]
 
     def _fitting(self) -> list[Node]:
         required, config = self.requirement, self.config
@@ -303,12 +292,12 @@ class Choice:
                 domain = self.config.domain_of[node.id].name
                 reasons.append(f"is in access domain '{domain}', which does not permit this demand")
                 places[self.config.place_of(DOMAINS_FILE)] = None
-            elif not reasons and (short := self.full.get(node.id) or self._shortage(node)):
+            elif not reasons and (short := self._shortage(node)):
                 reasons, code = short, NO_ROOM
             elif not reasons:
-                reasons.append("meets the requirement, but the demand would be refused there")
-                if node.id in self.refused:
-                    reasons = [f"{reasons[0]}: {self.refused[node.id]}"]
+                refusal = self.refused.get(node.id)
+                why = f": {refusal.faults[0].message}" if refusal else ""
+                reasons.append(f"meets the requirement, but the demand would be refused there{why}")
             # a node that is only full, or where only a rule is in the way, nearly fits
             misses.append((lacking, len(reasons), rank(node), f"'{node.id}' {joined(reasons)}"))
         shown = [text for *_, text in nsmallest(_MOST_SHOWN, misses)]

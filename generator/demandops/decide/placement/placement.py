@@ -284,9 +284,10 @@ class _Search(Generic[_Result]):
                 )
                 self._last = placed, self._tried(placed)
 
-        chosen = chosen or choice.first(attempt)[0]
+        if chosen is None:
+            chosen, _ = choice.first(attempt)
+            choice.take(chosen.node)
         self._demanded[index] = choice.on(chosen)
-        choice.take(chosen.node)
 
     def _tried(self, demanded: tuple[Item, ...]) -> _Result:
         request = replace(self._request, demanded=demanded)

@@ -164,7 +164,7 @@ def with_moves(
                 keys += [change.key for change in move.changes]
                 on = f"is placed on {quoted(chosen.node)}, {chosen.why}"
                 moved += [f"{text} {on}" for text in what]
-            attempts += len(choice.full) + len(choice.refused)
+            attempts += len(choice.refused)
     else:
         last = ""
     moves = claim_changes(start.ledger, world.ledger, keys)
