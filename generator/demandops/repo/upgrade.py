@@ -17,8 +17,7 @@ from demandops.base.errors import InvalidInput, StateRepoError, fault
 from demandops.base.runtime import REAL
 from demandops.base.settings import LEDGER_API_VERSION, RENDER_VERSION
 from demandops.decide.changeset import planned_releases
-from demandops.decide.edits import faults_of_edit
-from demandops.decide.placement.relocation import update_ledger
+from demandops.decide.edits import faults_of_edit, update_ledger
 from demandops.decide.planning.flows import with_booked_topics_marked
 from demandops.decide.state import State
 from demandops.model.config.appdef import without_ignored_fields

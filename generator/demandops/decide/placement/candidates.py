@@ -224,8 +224,7 @@ class Choice:
         return [  # there may be thousands, so what is cheap to see comes first
             node
             for node in pool
-            if not node.drained
-            and node.id in config.domain_of
+            if not self._closed(node)
             and (not role or node.type == role)
             and all(capability in node.capabilities for capability in capabilities)
             and not ((labels or required.properties) and any(lacks(node, required)))

@@ -15,7 +15,7 @@ from datetime import datetime, timedelta, timezone
 from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
-from demandops.decide.placement.relocation import expired_overrides
+from demandops.decide.edits import expired_overrides
 from demandops.model.demand.demand import Demand
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger, World
