@@ -184,12 +184,14 @@ class Choice:
         # The same on each node, so it is found only once, unless an override may move a service
         if self._starting is None or any(override.node for override in world.overrides):
             app = on_node(self.app, node, self.service, world)
-            # Each has one replica or more, unless an override stops some.
-            stops = any(override.replicas == 0 for override in world.overrides)
+            overridden = [each.replicas for each in world.overrides if each.replicas is not None]
             self._starting = {
-                key: {name: amount_of(quantity) for name, quantity in service.requests.items()}
+                key: {
+                    name: amount_of(quantity) * min([service.scaling.least, *overridden])
+                    for name, quantity in service.requests.items()
+                }
                 for service in self.config.services.get(app.appdef, {}).values()
-                if service.requests and not service.at_source and not service.nodes and not stops
+                if service.requests and not service.at_source and not service.nodes
                 if self.service in (None, service)
                 for key in instances(app, service)
                 if key.node == node
