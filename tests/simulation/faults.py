@@ -217,8 +217,7 @@ plant("leave_drained_nodes_full", 4, Draining, "is_due", nothing)
 plant("leave_drained_nodes_full", 4, Draining, "move_due", nothing)
 plant("place_on_drained_nodes", 3, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 0, placement, "_booked", nothing)
-plant("count_no_room", 3, Choice, "_shortage", lambda *_: [])
-plant("count_no_room", 3, capacity, "refuse_excess", nothing)
+plant("count_no_room", 3, capacity, "exceeded", lambda *_: [])
 
 
 @wrong(0, Usage, "plus")

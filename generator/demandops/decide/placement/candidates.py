@@ -147,7 +147,7 @@ class Choice:
         order = self.config.repo_settings.placement
         skipped: dict[str, None] = {}
         for node in sorted(fitting, key=rank):
-            if self._shortage(node):
+            if self._is_full(node):
                 skipped["that have room"] = None
                 continue
             if not self._is_permitted(node):
@@ -170,7 +170,7 @@ class Choice:
 
     def has_room(self, node: str) -> bool:
         entry = self.config.nodes.get(node)
-        return entry is not None and self.fits(node) and not self._shortage(entry)
+        return entry is not None and self.fits(node) and not self._is_full(entry)
 
     def take(self, node: str) -> None:
         """Count the application or service on a node, for the choices that follow."""
@@ -205,13 +205,18 @@ class Choice:
                 growth[host, resource] = growth.get((host, resource), 0) + amount
         return growth
 
+    def _is_full(self, node: Node) -> bool:
+        if node.capacity is None or node.id in self.room.given_back:
+            return False
+        return any(capacity.exceeded(self.room.usage, self._growth(node.id), self.config))
+
     def _shortage(self, node: Node) -> list[str]:
         """Return, in words, each resource of which a node has too little; empty if it has room."""
         refusal = self.refused.get(node.id)
         if refusal is not None:
             full = refusal.full if isinstance(refusal, NoRoom) else {}
             return full.get(self.config.host_of(node.id), [])
-        if node.capacity is None or node.id in self.room.given_back:
+        if not self._is_full(node):
             return []
         growth, config = self._growth(node.id), self.config
         return [excess for _, excess in capacity.excesses(self.room.usage, growth, config)]
@@ -222,14 +227,15 @@ class Choice:
         # Of the nodes with each required trait, only the shortest list is searched.
         pools = [config.nodes_with.get(trait, ()) for trait in traits]
         pool = min((config.nodes_by_role.get(required.role, ()), *pools), key=len)
-        role, labels, capabilities = required.role, required.label_pairs, required.capabilities
+        role, wanted = required.role, {*required.capabilities}
+        more = required.labels or required.properties
         return [  # there may be thousands, so what is cheap to see comes first
             node
             for node in pool
             if not self._closed(node)
             and (not role or node.type == role)
-            and all(capability in node.capabilities for capability in capabilities)
-            and not ((labels or required.properties) and any(lacks(node, required)))
+            and not wanted.difference(node.capabilities)
+            and not (more and any(lacks(node, required)))
         ]
 
     def _is_home(self, node: Node) -> bool:

@@ -93,19 +93,23 @@ def requests(plans: Plans, config: Config) -> Counter[Need]:
     return total
 
 
-def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
-    """Yield (node, reason) for each resource of which a node has too little for the growth."""
-    for (id, resource), amount in sorted(grown.items()):
-        node = config.nodes.get(id)
-        most = node.most(resource) if node else None
-        used = usage.of(id, resource)
+def exceeded(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[Need, int]]:
+    """Yield (need, capacity) for each resource of which a node has too little for the growth."""
+    for need, amount in grown.items():
+        node = config.nodes.get(need[0])
+        most = node.most(need[1]) if node else None
         # Only growth is refused. If a person lowers a capacity below what is used, no demand is
         # stopped that adds nothing there.
-        if most is None or amount <= 0 or used + amount <= most:
-            continue
-        free, capacity = (amount_text(each, resource) for each in (max(most - used, 0), most))
-        asked = amount_text(amount, resource)
-        yield id, f"has {free} of {capacity} {resource} free, but {asked} is asked for"
+        if most is not None and amount > 0 and usage.of(*need) + amount > most:
+            yield need, most
+
+
+def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
+    """Yield (node, reason) for each resource of which a node has too little for the growth."""
+    for need, most in sorted(exceeded(usage, grown, config)):
+        resource, left = need[1], max(most - usage.of(*need), 0)
+        free, capacity, asked = (amount_text(n, resource) for n in (left, most, grown[need]))
+        yield need[0], f"has {free} of {capacity} {resource} free, but {asked} is asked for"
 
 
 class NoRoom(Refused):
