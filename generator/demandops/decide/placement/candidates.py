@@ -285,13 +285,14 @@ class Choice:
         """Return the fault if no node fits: why, beginning with the nodes that nearly fit."""
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")
-        rank, code = self._rank(), "no-node"
-        misses: list[tuple[int, int, tuple[bool, float, float, str], str]] = []
+        rank, codes = self._rank(), set[str]()
+        misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
         places = {self.config.place_of(NODES_FILE): None}
         for node in self.config.nodes_by_role.get(self.requirement.role, ()):
             missing = list(lacks(node, self.requirement))
             reasons = [f"lacks {joined(missing)}"] if missing else []
             reasons += filter(None, [self._closed(node)])
+            # What lacks nothing comes first: it is only full, or a rule is in the way.
             lacking = len(missing) + len(reasons) - bool(missing)
             if not missing and node.id not in self.config.domain_of:
                 places[self.config.place_of(DOMAINS_FILE)] = None
@@ -299,21 +300,21 @@ class Choice:
                 domain = self.config.domain_of[node.id].name
                 reasons.append(f"is in access domain '{domain}', which does not permit this demand")
                 places[self.config.place_of(DOMAINS_FILE)] = None
-            elif not reasons and (short := self._shortage(node)):
-                reasons, code = short, NO_ROOM
+            elif not reasons and (reasons := self._shortage(node)):
+                codes.add(NO_ROOM)
             elif not reasons:
+                codes.add("no-node")  # more room alone would not help
                 refusal = self.refused.get(node.id)
                 why = f": {refusal.faults[0].message}" if refusal else ""
-                reasons.append(f"meets the requirement, but the demand would be refused there{why}")
-            # a node that is only full, or where only a rule is in the way, nearly fits
-            misses.append((lacking, len(reasons), rank(node), f"'{node.id}' {joined(reasons)}"))
+                reasons = [f"meets the requirement, but the demand would be refused there{why}"]
+            misses.append((lacking, rank(node), f"'{node.id}' {joined(reasons)}"))
         shown = [text for *_, text in nsmallest(_MOST_SHOWN, misses)]
         hidden = len(misses) - len(shown)
         more = [f"{hidden} more {'are' if hidden > 1 else 'is'} not shown"] if hidden else []
         message = f"no node fits: {'; '.join([*shown, *more]) or 'the inventory has no node'}"
         less = f"change 'place' in {self.service.file}" if self.service else "ask for less"
         message += f"; {less}, or ask for a change of {' or '.join(places)}"
-        return self._fault(message, code)
+        return self._fault(message, NO_ROOM if codes == {NO_ROOM} else "no-node")
 
     def _fault(self, message: str, code: str) -> Fault:
         if self.service is None:
