@@ -128,8 +128,9 @@ def decide(
         now: when the demand was received, with time zone.
         on_stage: called when the demand is admitted and when it is booked, each at most once.
             Later checks may still refuse an admitted demand.
-        throttle: called if all other checks of admission find no fault, perhaps twice for one
-            demand. It is not called for a :class:`Decommission` and for the generator's own.
+        throttle: called if all other checks of admission find no fault, for one demand perhaps
+            with several nodes. It is not called for a :class:`Decommission` and for the
+            generator's own.
         checkpoint: called often while a demand that may add claims is decided, and raises
             :class:`OverBudget` to end the decision. It can only refuse a demand, never change what
             is decided.

@@ -292,28 +292,30 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
         for app in [world.ledger.application(id)]
         if app is not None and change(app) != app
     ]
-    together, alone = moving, list[str]()
-    names = collisions.all_names(world) if moving else collisions.NONE
-    while together:  # applications that share a service must move at the same time
-        after, changes, moved_names = _all_moved(world, together, change, names)
-        faulty = [
-            id for id, own in changes.items() if next(_faults(world, after, own, moved_names), None)
-        ]
-        if not faulty:
-            break
-        together, alone = [id for id in together if id not in faulty], [*alone, *faulty]
     keys, stays = list[ClaimKey](), list[tuple[str, str]]()
-    # A fault of one application may have come from another that did not move in the end. So each
-    # that caused a fault is tried again, alone, after the others have moved.
-    for ids in filter(None, (together, *([id] for id in alone))):
-        after, changes, moved_names = _all_moved(world, ids, change, names)
-        faults = (
-            fault for own in changes.values() for fault in _faults(world, after, own, moved_names)
-        )
-        fault = None if ids is together else next(faults, None)
-        if fault is None:
+    names = collisions.all_names(world) if moving else collisions.NONE
+    groups = (
+        [moving] if moving else []
+    )  # applications that share a service must move at the same time
+    while groups:
+        ids = groups.pop(0)
+        after, changes = world, dict[str, tuple[ClaimChange, ...]]()
+        for id in ids:
+            after, changes[id] = with_moved(after, after.ledger.application_claims(id), change)
+        every = [each for own in changes.values() for each in own]
+        moved_names = collisions.followed(names, world, after, affected_keys(world, after, every))
+        faults = {
+            id: fault
+            for id, own in changes.items()
+            if (fault := next(_faults(world, after, own, moved_names), None))
+        }
+        if not faults:
             world, names = after, moved_names
-            keys += [each.key for own in changes.values() for each in own]
+            keys += [each.key for each in every]
+        elif len(ids) > 1:
+            # A fault of one application may have come from another that does not move in the end.
+            # So each that caused a fault is tried again, alone, after the others have moved.
+            groups = [[id for id in ids if id not in faults], *groups, *([id] for id in faults)]
         else:
             app = world.ledger.application(ids[0])
             assert app is not None  # noqa: S101 - it is claimed
@@ -326,7 +328,7 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
                 if override.node and services:
                     message = (
                         f"does not move {' and '.join(services)} of application '{app.id}' to "
-                        f"'{override.node}': {fault.message}"
+                        f"'{override.node}': {faults[app.id].message}"
                     )
                     stays.append((override.path, message))
     return LedgerUpdate(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
@@ -341,16 +343,6 @@ def with_restored_moves(request: Restoration, world: World) -> Restoration:
     for claim in request.claims:
         ledger = ledger.replace(claim.key, claim)
     return replace(request, claims=tuple(following_overrides(replace(world, ledger=ledger)).ledger))
-
-
-def _all_moved(
-    before: World, applications: Iterable[str], move: Move, names: Names
-) -> tuple[World, dict[str, tuple[ClaimChange, ...]], Names]:
-    world, changes = before, dict[str, tuple[ClaimChange, ...]]()
-    for id in applications:
-        world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
-    keys = affected_keys(before, world, [each for own in changes.values() for each in own])
-    return world, changes, collisions.followed(names, before, world, keys)
 
 
 def _faults(
