@@ -114,6 +114,14 @@ def test_what_no_node_changes_is_not_tried_on_each_node(refused: dict[str, Any],
     assert twice < 2.5 * many, "the cost must grow with the demand and not faster"
 
 
+def test_a_placement_on_a_thousand_nodes_costs_little_more_than_on_ten() -> None:
+    made, work = demand([app(0, connect="none")]), []
+    for books in (repo(10), repo(1_000)):
+        assert books.decide(made).outcome == "booked"  # templates are compiled once
+        work.append(work_of(books, made)[0])
+    assert work[1] < 3 * work[0]
+
+
 DENIED = {"overrides/no.yaml": override({"nodes": [f"e{n:03}" for n in range(10)]}, deny=True)}
 
 
