@@ -33,6 +33,7 @@ from demandops.model.demand.demand import Application, Demand, Item, Requirement
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World
 
+# The time of a claim that is judged but not booked
 _NEVER = datetime.max.replace(tzinfo=timezone.utc)
 
 _Result = TypeVar("_Result")
@@ -64,10 +65,10 @@ def search(
 
     ``checkpoint`` is called at each step; it may raise an exception to end the search.
     """
-    if not request.adds_claims or not needs_placement(request, state):
+    if not request.adds_claims or not _needs_placement(request, state):
         return attempt(request, ())
-    search = _Search(request, state, attempt, checkpoint)
-    placed, faults = search.placed()
+    places = _Places(request, state, attempt, checkpoint)
+    placed, faults = places.placed()
     try:
         return attempt(placed, faults)
     except Refused as refusal:
@@ -79,7 +80,7 @@ def search(
             raise
         first = refusal
     try:
-        return search.one_by_one()
+        return places.one_by_one()
     except OverBudget as spent:
         # with the faults of the first refusal: they tell the requester what to change
         raise Refused([fault("", str(spent), code="too-large"), *first.faults]) from None
@@ -88,7 +89,7 @@ def search(
         raise refusal if lacks_room else first from None
 
 
-def needs_placement(request: Demand, world: World) -> bool:
+def _needs_placement(request: Demand, world: World) -> bool:
     # A service with a node of its own, in the request or in the ledger, needs its node checked.
     apps = (item.held for item in request.demanded if isinstance(item.held, Application))
     return any(
@@ -105,7 +106,9 @@ def _services_to_place(app: Application, world: World) -> list[Service]:
     return [service for service in services if service.place and service.name not in app.named]
 
 
-class _Search(Generic[_Result]):
+class _Places(Generic[_Result]):
+    """The nodes of one request's applications and services, chosen one after another."""
+
     def __init__(
         self,
         request: Demand,
@@ -254,7 +257,7 @@ class _Search(Generic[_Result]):
     def _place_service(self, index: int, service: Service) -> None:
         choice = self._choice(self._demanded[index], requirement_of(service), service)
         first = self._state.ledger.application(choice.app.id)
-        is_same = first is not None and first.appdef == choice.app.appdef
+        is_same = first and first.appdef == choice.app.appdef
         here = first.services.get(service.name, "") if first and is_same else ""
         shared = _shared_node(choice.app, service, self._state)
         chosen = None
@@ -318,15 +321,14 @@ def may_wait(request: Demand, state: State, checkpoint: Callable[[], None]) -> b
             choices.append(Choice(item, requirement_of(service), room, service))
         for choice in choices:
             checkpoint()
-            for node in choice.nodes():
-                if state.config.domain_of[node].when_full == "wait":
-                    held = candidates.on_node(app, node, choice.service, state).booked()
-                    claim = Claim(held, request.demand, request.id, item.requesters, _NEVER)
-                    # A person approves only what can be booked at once, so what needs approval
-                    # cannot wait.
-                    if not permission.approval_reasons(request, [(None, claim)], state.config):
-                        break
-            else:
+            waiting = (
+                choice.on(Chosen(node, "")).held.booked()
+                for node in choice.nodes()
+                if state.config.domain_of[node].when_full == "wait"
+            )
+            claims = (Claim(held, "", request.id, item.requesters, _NEVER) for held in waiting)
+            # A person approves only what can be booked at once, so what needs approval cannot wait.
+            if all(permission.approval_reasons(request, [(None, c)], state.config) for c in claims):
                 return False
     return True
 
