@@ -19,7 +19,7 @@ from demandops.decide import booking, changeset, decision, edits
 from demandops.decide.admission import completing, permission
 from demandops.decide.checks import quotas
 from demandops.decide.decision import Decision
-from demandops.decide.placement import placement
+from demandops.decide.placement import capacity, placement
 from demandops.decide.placement.candidates import Choice
 from demandops.decide.placement.capacity import Usage
 from demandops.decide.planning import overrides, planner, release_keys
