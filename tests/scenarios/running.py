@@ -16,7 +16,8 @@ import yaml
 from demandops.base.errors import Fault, Refused
 from demandops.decide.booking import Drain
 from demandops.decide.decision import Decision, decide
-from demandops.decide.placement.relocation import changed_claim_files, following_overrides
+from demandops.decide.edits import changed_claim_files
+from demandops.decide.placement.relocation import following_overrides
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.base_model import FrozenModel, parse_file, seconds_of
 from demandops.model.config.load import load

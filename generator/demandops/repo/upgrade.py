@@ -18,8 +18,7 @@ from demandops.base.runtime import REAL
 from demandops.base.settings import LEDGER_API_VERSION, RENDER_VERSION
 from demandops.decide.carriers import with_one_carrier
 from demandops.decide.changeset import planned_releases
-from demandops.decide.decision import faults_of_edit
-from demandops.decide.placement.relocation import changed_claim_files, update_ledger
+from demandops.decide.edits import changed_claim_files, faults_of_edit, update_ledger
 from demandops.decide.planning.flows import with_booked_topics_marked
 from demandops.decide.state import State
 from demandops.model.config.appdef import without_ignored_fields

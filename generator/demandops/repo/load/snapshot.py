@@ -17,7 +17,7 @@ from pygit2 import Blob, GitError, Oid, Repository, Tree
 from demandops.base.errors import Fault, InvalidInput, OverLimit, StateRepoError, fault
 from demandops.base.naming import Subject
 from demandops.base.settings import GENERATED_ROOTS
-from demandops.decide.decision import changeset_of_edit, faults_of_edit
+from demandops.decide.edits import changeset_of_edit, faults_of_edit
 from demandops.decide.state import State, rendered_files, try_configuration
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.load import load as load_config

@@ -19,10 +19,10 @@ from pygit2 import Signature
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.quoting import one_line
 from demandops.base.settings import GENERATED_ROOTS
+from demandops.decide import edits
 from demandops.decide.booking import Drain
 from demandops.decide.changeset import Change, Changeset, ReleaseChange
-from demandops.decide.decision import Decision, changeset_of_edit, decide
-from demandops.decide.placement import relocation
+from demandops.decide.decision import Decision, decide
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import NODES_FILE
 from demandops.model.config.override import Override
@@ -136,7 +136,7 @@ class CommitBatch:
         if not files:
             return
         overrides = [
-            *relocation.changed_override_files(before.state, state),
+            *edits.changed_override_files(before.state, state),
             *change.overrides,
         ]
         of_overrides = commit_message.override_trailers(overrides, keys)
@@ -166,7 +166,7 @@ class CommitBatch:
             try:
                 marked = last_valid_config.end_markers_at(self._tree)
                 state, subjects = accepted.snapshot.state, accepted.subjects
-                applied = relocation.update_ledger(before.state, state, subjects, marked, now)
+                applied = edits.update_ledger(before.state, state, subjects, marked, now)
                 state = replace(state, ledger=applied.ledger)
                 change = self.render_all(state, applied.files)
             except InvalidInput as error:
@@ -174,11 +174,11 @@ class CommitBatch:
         if change is None:
             # with the configuration as before, only the subjects that people changed are rendered
             state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
-            applied = relocation.update_claims(old, state, subjects, now)
+            applied = edits.update_claims(old, state, subjects, now)
             touched = claim_changes(state.ledger, applied.ledger, applied.keys)
             state = state.with_ledger(applied.ledger, touched)
             subjects = tuple(dict.fromkeys((*subjects, *(edit.key.subject for edit in touched))))
-            change = changeset_of_edit(state, old, subjects, self.read)
+            change = edits.changeset_of_edit(state, old, subjects, self.read)
             change = replace(change, files={**applied.files, **change.files})
         # an approved claim's lease starts only now, because else it could end before the approval
         snapshot, ledger, files = accepted.snapshot, state.ledger, dict(change.files)
@@ -195,7 +195,7 @@ class CommitBatch:
 
     def end_override(self, override: Override, now: datetime) -> None:
         # InvalidInput is raised if the state without the override cannot be planned or rendered
-        applied = relocation.end_override(self.head.state, override, now)
+        applied = edits.end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
         more = snapshots.trailers_of(self.head)
