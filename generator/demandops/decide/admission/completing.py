@@ -10,7 +10,7 @@ from demandops.connections.connection import Connection
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
 from demandops.decide.placement import placement
-from demandops.decide.planning import flows
+from demandops.decide.planning import chains, flows
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.inventory import id_in_domain
@@ -40,16 +40,19 @@ def completed(
     # the id of a separate instance comes first, because the placement looks for claims on it
     demand = with_separate_instances(demand, config)
     demand, unclear = with_chosen_domains(demand, config, ledger)
-    demand = flows.with_further_topics(demand, ledger, config)
+    demand, unread = chains.with_topics_of_outputs(demand, ledger, config)
     demand, not_placed = placement.with_chosen_nodes(
         demand, state, state.usage(), trial, checkpoint
     )
-    return placed(demand, state), [*unclear, *not_placed]
+    return placed(demand, state), [*unclear, *unread, *not_placed]
 
 
 def placed(demand: AnyDemand, state: State) -> AnyDemand:
     """Return a demand, whose nodes are chosen, with all else that the generator adds."""
     config, ledger = state.config, state.ledger
+    # again, because the nodes of listed applications may have been open
+    demand, _ = chains.with_topics_of_outputs(demand, ledger, config)
+    demand = chains.with_held_applications(demand, ledger, config)
     demand = permission.with_lease_terms(demand, config)
     # clients of the reference list their connections, and later shut down just what they listed
     if not demand.is_reference:

@@ -334,7 +334,7 @@ def with_implied_connections(request: AnyDemand, ledger: Ledger, config: Config)
             if (flow.receiver, flow.target) in brought or not is_valid:
                 continue
             needed = connection_for(flow, app.connect, ledger)
-            field = places.get(flow.root, "node")
+            field = item.needed_by or places.get(flow.root, "node")
             if flow.delivery is not None:
                 field = f"deliver[{flow.delivery}]"
             note = ""

@@ -34,7 +34,11 @@ from demandops.model.config.inventory import Position, read_condition
 
 @dataclass(frozen=True, slots=True)
 class InputTopic:
-    """An input topic of an application, and the node that publishes it."""
+    """An input topic of an application, and the node that publishes it.
+
+    A demand may instead name an ``output`` of an ``application``, as ``<service>.<output>`` or
+    without the service. The claim has them beside the topics that they meant (:mod:`.chains`).
+    """
 
     __pydantic_config__: ClassVar = PART
 
@@ -44,13 +48,15 @@ class InputTopic:
     # It was not the usual topic of its source when it was booked. The claim says so, because a name
     # that is made from it must not change while it is demanded (:mod:`.flows`).
     further: Annotated[StrictBool, RECORDED, SkipJsonSchema()] = False
+    application: str = ""
+    output: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "topic", absolute_topic(self.topic))
 
     @property
-    def order(self) -> tuple[str, str, str, bool]:
-        return self.topic, self.source, self.type, self.further
+    def order(self) -> tuple[str, str, str, bool, str, str]:
+        return self.topic, self.source, self.type, self.further, self.application, self.output
 
     def part_in(self, version: str) -> str:
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
@@ -162,6 +168,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     moved: Annotated[Mapping[str, str], RECORDED, SkipJsonSchema()] = field(default_factory=dict)
     # the services whose node the demand itself names; the generator chose the nodes of the others
     named: Annotated[Items[str], RECORDED, SkipJsonSchema()] = ()
+    # The demand does not list it, but holds it for these applications: the outputs that each reads.
+    held_for: Annotated[Mapping[str, Items[str]], RECORDED, SkipJsonSchema()] = field(
+        default_factory=dict
+    )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Application):
@@ -189,6 +199,14 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     def all_inputs(self) -> list[tuple[str, InputTopic]]:
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
+
+    @property
+    def read_outputs(self) -> dict[str, tuple[str, ...]]:  # of other applications
+        read: dict[str, set[str]] = {}
+        for _, topic in self.all_inputs():
+            if topic.application:
+                read.setdefault(topic.application, set()).add(topic.output)
+        return {id: tuple(sorted(outputs)) for id, outputs in sorted(read.items())}
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
         # the inputs must be sorted, as in a claim
@@ -314,6 +332,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ("moved",)
         for role, topic in self.all_inputs():
             yield ("takes", topic.source, topic.topic)
+            if topic.application:
+                yield ("reads", topic.application)
             yield ("node", topic.source)
             if topic.further or self.separate:
                 yield ("further", topic.part_in(self.own_version))
@@ -493,7 +513,9 @@ class Demand:
         # Goals of the reference's action that share a requester keep their order. For example, of
         # two equal shutdowns, the second has an effect only if a join came between them.
         names = self.requesters() if self.is_reference else ()
-        return frozenset((*self.subjects(), ("demand", self.demand), *names))
+        apps = (item.held for item in self.demanded if isinstance(item.held, Application))
+        read = (Subject(SubjectKind.APPLICATION, id) for app in apps for id in app.read_outputs)
+        return frozenset((*self.subjects(), *read, ("demand", self.demand), *names))
 
 
 AnyDemand = TypeVar("AnyDemand", bound=Demand)

@@ -98,6 +98,9 @@ class Ledger:
             if claim is not None:
                 yield claim
 
+    def claims_reading_outputs(self, application: str) -> tuple[Claim, ...]:
+        return self._claims("reads", application)
+
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
         for claim in self.each_reading(source, topic):
             if inputs := claim.application.inputs_from(role, source, topic):
