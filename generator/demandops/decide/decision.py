@@ -474,6 +474,7 @@ def notes_on(request: Demand, after: World, changes: Changes, rendered: Changese
                     "the inventory), so no client of this connection carries it"
                 )
     yield from warnings.notes(request, after)
+    yield from warnings.lost_output_notes(changes, after)
     yield from rendered.blocked
     if isinstance(request, Drain):
         yield from request.stays

@@ -9,22 +9,26 @@ from dataclasses import dataclass
 from itertools import groupby, islice, takewhile
 
 from demandops.base.errors import MOST_FAULTS, Fault, fault, suggestion
+from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, needed_access
 from demandops.decide.booking import Drain
-from demandops.decide.checks.collisions import all_names
+from demandops.decide.checks.collisions import all_names, publishers
 from demandops.decide.placement.candidates import lacks, requirement_of, unmet
 from demandops.decide.placement.capacity import overcommitted, whole_usage
 from demandops.decide.placement.relocation import following_overrides, with_moves
-from demandops.decide.planning.flows import flows
+from demandops.decide.planning import chains
+from demandops.decide.planning.flows import flows, topics_of_origin
 from demandops.decide.planning.overrides import without_suspended
+from demandops.decide.planning.release_keys import claims_needing
 from demandops.model.config.appdef import ignored_fields
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.policy import AccessDomain, matches
-from demandops.model.demand.demand import Application, Demand
+from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.ledger import World
+from demandops.model.ledger.claim import Claim, ClaimKey, demand_id
+from demandops.model.ledger.ledger import Changes, World
 from demandops.templating import charts
 
 # ---- missing inputs: topics that applications read or deliver, but that do not arrive ----
@@ -54,7 +58,7 @@ def missing_inputs(world: World) -> list[MissingInput]:
         MissingInput(claim.application.id, claim_files.path_of(claim.key), reason)
         for claim in active.ledger
         if claim.is_on_application
-        for reason in _reasons(claim.application, active)
+        for reason in (*_reasons(claim.application, active), *_changed_outputs(claim, active))
     }
     return sorted(missing, key=lambda each: (each.application, each.reason, each.file))
 
@@ -87,6 +91,91 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
             )
 
 
+def _changed_outputs(claim: Claim, active: World) -> Iterator[str]:
+    app, ledger = claim.application, active.ledger
+    if not (read := app.read_outputs):
+        return
+    held = {
+        id
+        for id in read
+        if ledger.get(ClaimKey(Subject(SubjectKind.APPLICATION, id), claim.demand))
+    }
+    current = {*chains.followed(app, claim.demand, ledger, active.config).topic_keys()}
+    for role, topic in app.all_inputs():
+        is_current = (role, topic.topic, topic.source) in current and topic.application in held
+        if topic.application and not is_current:
+            yield (
+                f"{role} {topic.topic} of '{topic.source}' does not arrive: the demand no longer "
+                f"has it from application '{topic.application}'; put the demand again"
+            )
+
+
+# ---- outputs of applications that others read by the names of the topics alone ----
+#
+# The demand of such a reader does not hold the application, and is not asked when it ends.
+
+
+def unheld_output_warnings(world: World) -> Iterator[Fault]:
+    for claim in sorted(world.ledger, key=lambda claim: claim_files.path_of(claim.key)):
+        for note in _unheld_outputs(claim.held, claim.demand, world):
+            yield fault("", note).within(claim_files.path_of(claim.key))
+
+
+def _unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
+    if not isinstance(held, Application) or held.held_for:
+        return
+    services = (each for services in world.config.services.values() for each in services.values())
+    patterns = {re.escape(each) for service in services for each in service.outputs.values()}
+    could_be_output = re.compile("|".join(patterns).replace(r"\{instance\}", ".+")).fullmatch
+    told = set[tuple[str, str]]()
+    for _, input in held.all_inputs():
+        if input.application or not could_be_output(input.topic):
+            continue
+        place = (input.topic, input.source)
+        makers = [
+            claim
+            for key in publishers(world, input.source, input.topic)
+            for claim in claims_needing(world, key)
+        ]
+        if not makers or any(claim.demand == demand for claim in makers):
+            continue
+        app = makers[0].application
+        output = next(name for name, *at in _outputs_of(app, world.config) if (*at,) == place)
+        if (app.id, output) not in told:  # a service may make thousands of topics
+            told.add((app.id, output))
+            yield (
+                f"application '{held.id}': {input.topic} of '{input.source}' is an output of "
+                f"application '{app.id}', which may end before this demand; to hold it, write "
+                f"{{application: {app.id}, output: {output}}} instead of the topic"
+            )
+
+
+def lost_output_notes(changes: Changes, after: World) -> Iterator[str]:
+    """Yield who still reads the outputs that are no longer made after these changes."""
+    for change in changes.claims:
+        if change.before is None or not change.before.is_on_application or change.only_renews:
+            continue
+        app = change.before.application
+        lost: dict[ClaimKey, str] = {}
+        for output, topic, node in _outputs_of(app, after.config):
+            reading = [each.key for each in after.ledger.each_reading(node, topic)]
+            if reading and next(publishers(after, node, topic), None) is None:
+                lost |= dict.fromkeys(sorted(reading, key=str), f"{topic} of '{node}' ({output})")
+        for key, what in lost.items():
+            yield (
+                f"{key.subject} of demand '{key.demand}' still reads {what}, which application "
+                f"'{app.id}' no longer makes"
+            )
+
+
+def _outputs_of(app: Application, config: Config) -> Iterator[tuple[str, str, str]]:
+    # (output, topic, node)
+    for service in config.services.get(app.appdef, {}).values():
+        for output in (f"{service.name}.{name}" for name in service.outputs):
+            for made in topics_of_origin(config, app, output):
+                yield output, made.topic.topic, made.node
+
+
 # ---- misspelled topics, which differ by a letter from a known topic of the node ----
 #
 # Nobody lists all topics of a node, so an unknown topic alone is no mistake. Names that differ in a
@@ -101,7 +190,9 @@ def notes(request: Demand, world: World) -> Iterator[str]:
     if request.adds_claims:
         known = _KnownTopics(world)
         for item in request.demanded:
+            demand = request.demand or demand_id(request.id, item.requesters)
             yield from known.notes_on(item.held)
+            yield from _unheld_outputs(item.held, demand, world)
 
 
 def misspelled_topic_warnings(world: World) -> Iterator[Fault]:

@@ -56,7 +56,7 @@ def topic_faults(
                 continue
             # Only services that run before and after the demand count. If an application moves, a
             # connection may bring the application's output back to the old node.
-            staying = (key for key in _publishers(before, node, topic) if is_needed(after, key))
+            staying = (key for key in publishers(before, node, topic) if is_needed(after, key))
             for other in islice(staying, 1):
                 yield item.fault(
                     f"topics[{index}].{'source' if route.reverse else 'target'}",
@@ -84,15 +84,15 @@ def _clashes_of_service(request: Demand, after: World, key: ServiceKey) -> Itera
         booked = after.ledger.booked_input(service.root, str(key.source), str(key.topic))
         further = bool(booked and booked.further)
     for name, topic in outputs(after.config, service, key, further=further).items():
-        publishers = (
+        published = (
             (f"{words(other)} already publishes this topic on", other)
-            for other in _publishers(after, key.node, topic, excluded=key)
+            for other in publishers(after, key.node, topic, excluded=key)
         )
         connections = (
             (f"connection '{id}' already brings this topic to", None)
             for id in after.ledger.connections_bringing(key.node, topic)
         )
-        for clash, other in chain[tuple[str, ServiceKey | None]](publishers, connections):
+        for clash, other in chain[tuple[str, ServiceKey | None]](published, connections):
             remedy = _remedy(key, other, service, name, after.config)
             message = (
                 f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}"
@@ -132,7 +132,7 @@ def _clashes_of_flows(item: Item, app: Application, after: World) -> Iterator[Fa
                 yield item.fault(f"deliver[{flow.delivery}].topic", message, code="conflict")
 
 
-def _publishers(
+def publishers(
     world: World, node: str, topic: str, *, excluded: ServiceKey | None = None
 ) -> Iterator[ServiceKey]:
     """Yield the keys of the needed instances on a node that publish ``topic``."""
