@@ -82,6 +82,8 @@ class DemandEntry:
     action: Literal["Demand", "DeploymentRequest"]  # the ROS action that takes such a demand
     request: str
     requesters: list[str]
+    # applications that it does not list, each with those that read its outputs
+    held_for: dict[str, list[str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +169,11 @@ def bookkeeping(world: World) -> Bookkeeping:
             "DeploymentRequest" if claims[0].joined else "Demand",
             claims[0].request,
             list(requesters_of(claims)),
+            {
+                claim.subject.id: list(claim.application.held_for)
+                for claim in claims
+                if claim.is_on_application and claim.application.held_for
+            },
         )
         for demand, claims in sorted(by_demand.items())
     }
@@ -198,6 +205,9 @@ def _sorted(topics: dict[str, set[str]]) -> _Requesters:
 
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
     data = asdict(view) | {"commit": commit}
+    for entry in data["demands"].values():
+        if not entry["held_for"]:
+            del entry["held_for"]
     return {name: part for name, part in data.items() if part or name not in _LEFT_OUT}
 
 

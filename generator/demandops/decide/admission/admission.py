@@ -99,8 +99,7 @@ def _application_faults(app: Application, config: Config, claiming: bool) -> Ite
         (f"inputs.{role}[{position}]", topic)
         for role, topics in app.inputs.items()
         for position, topic in enumerate(topics)
-        # an output that is not known, or whose node is not chosen, has a fault of its own
-        if not topic.application or (topic.topic and topic.source)
+        if not topic.application  # its faults are those of the application whose output it is
     ]
     # a shutdown may leave out nodes and sources, because it lists what is booked already
     if claiming or app.node:

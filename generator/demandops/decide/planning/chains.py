@@ -107,7 +107,7 @@ def _with_topics(
         for index, (named, group) in enumerate(groups.items()):
             if not named[0]:
                 continue
-            made = _topics_of(group[0], producer(named[0]), ledger, config)
+            made = _current(group, producer(named[0]), ledger, config)
             if isinstance(made, Problem):
                 problems.append(made._replace(field=f"inputs.{role}[{index}]{made.field}"))
             else:
@@ -117,14 +117,17 @@ def _with_topics(
     return app.with_inputs(inputs), problems
 
 
-def _topics_of(
-    read: InputTopic, app: Application | None, ledger: Ledger, config: Config
+def _current(
+    group: list[InputTopic], app: Application | None, ledger: Ledger, config: Config
 ) -> list[InputTopic] | Problem:
+    read = group[0]
     if app is None:
         close = suggestion(read.application, ledger.subjects(SubjectKind.APPLICATION))
         message = f"{quoted(read.application)} is neither listed in this demand nor booked{close}"
         return Problem(".application", message, "unknown-application")
-    services = config.services.get(app.appdef, {}).values()
+    if app.appdef not in config.services:
+        return group  # admission reports it
+    services = config.services[app.appdef].values()
     outputs = [f"{service.name}.{output}" for service in services for output in service.outputs]
     meant = [each for each in outputs if read.output in (each, each.partition(".")[2])]
     if len(meant) != 1:
