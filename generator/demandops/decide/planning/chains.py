@@ -53,23 +53,30 @@ def with_topics_of_outputs(
     try:
         order.prepare()
     except CycleError as error:
-        ids = [*map(quoted, reversed(error.args[1]))]
+        *ring, _ = reversed(error.args[1])  # each reads the next
+        # the claims of others may also make one, if people wrote them
+        item = next((i for i in request.demanded if i.held.id in ring), request.demanded[0])
+        start = ring.index(item.held.id) if item.held.id in ring else 0
+        ids = [quoted(id) for id in (*ring[start:], *ring[: start + 1])]
         message = ", which reads ".join((f"{ids[0]} reads an output of {ids[1]}", *ids[2:]))
-        item = next(item for item in request.demanded if item.held.id in error.args[1])
         remedy = "read none that depends on this application's own"
         return request, [item.fault("inputs", f"{message}; {remedy}", code="conflict")]
     # First those that read no outputs, then those that read only theirs, and so on.
     faults, complete = list[Fault](), dict[int, Item]()
 
-    def producer(id: str) -> Application | None:
-        id = _id_of(id, listed)
-        return listed[id] if id in listed else _as_booked(id, request.demand, ledger, config)
+    def producer(name: str) -> Application | Problem:
+        id = _id_of(name, listed)
+        if app := listed.get(id) or _as_booked(id, request.demand, ledger, config):
+            return app
+        close = suggestion(name, {*listed, *ledger.subjects(SubjectKind.APPLICATION)})
+        message = f"{quoted(name)} is neither listed in this demand nor booked{close}"
+        return Problem(".application", message, "unknown-application")
 
     while order.is_active():
         order.done(*(ready := {*order.get_ready()}))
         for index, item in enumerate(request.demanded):
             if isinstance(item.held, Application) and item.held.id in ready:
-                app, problems = _with_topics(item.held, producer, ledger, config)
+                app, problems = _with_topics(item.held, producer, config)
                 complete[index] = replace(item, held=app)
                 faults += (item.fault(field, text, code=code) for field, text, code in problems)
         marked = replace(request, demanded=tuple(complete.values()))
@@ -92,7 +99,7 @@ def _id_of(id: str, listed: dict[str, Application]) -> str:
 
 
 def _with_topics(
-    app: Application, producer: Callable[[str], Application | None], ledger: Ledger, config: Config
+    app: Application, producer: Callable[[str], Application | Problem], config: Config
 ) -> tuple[Application, list[Problem]]:
     """Return an application with the topics that the outputs it reads have now.
 
@@ -107,7 +114,7 @@ def _with_topics(
         for index, (named, group) in enumerate(groups.items()):
             if not named[0]:
                 continue
-            made = _current(group, producer(named[0]), ledger, config)
+            made = _current(group, producer(named[0]), config)
             if isinstance(made, Problem):
                 problems.append(made._replace(field=f"inputs.{role}[{index}]{made.field}"))
             else:
@@ -118,13 +125,11 @@ def _with_topics(
 
 
 def _current(
-    group: list[InputTopic], app: Application | None, ledger: Ledger, config: Config
+    group: list[InputTopic], app: Application | Problem, config: Config
 ) -> list[InputTopic] | Problem:
     read = group[0]
-    if app is None:
-        close = suggestion(read.application, ledger.subjects(SubjectKind.APPLICATION))
-        message = f"{quoted(read.application)} is neither listed in this demand nor booked{close}"
-        return Problem(".application", message, "unknown-application")
+    if isinstance(app, Problem):
+        return app
     if app.appdef not in config.services:
         return group  # admission reports it
     services = config.services[app.appdef].values()
@@ -140,8 +145,8 @@ def _current(
         InputTopic(published.topic.topic, published.node, read.type, False, app.id, meant[0])
         for published in topics_of_origin(config, app, meant[0])
     ]
-    message = f"{meant[0]} of {quoted(app.id)} has no topic, because it has no input for it"
-    return topics or Problem(".output", f"{message}; list such an input, or read another output")
+    message = f"{meant[0]} of {quoted(app.id)} has no topic, because nothing is demanded for it"
+    return topics or Problem(".output", f"{message}; demand that first, or name another output")
 
 
 def _as_booked(id: str, demand: str, ledger: Ledger, config: Config) -> Application | None:
@@ -197,11 +202,11 @@ def _place(app: Application, read: str) -> str:
 def followed(app: Application, demand: str, ledger: Ledger, config: Config) -> Application:
     """Return a booked application with the topics of the outputs that it reads of ``ledger``."""
 
-    def producer(id: str) -> Application | None:
+    def producer(id: str) -> Application | Problem:
         claim = ledger.get(ClaimKey(Subject(SubjectKind.APPLICATION, id), demand))
-        return claim.application if claim else None
+        return claim.application if claim else Problem("", "")
 
-    moved, _ = _with_topics(app, producer, ledger, config)
+    moved, _ = _with_topics(app, producer, config)
     put = Demand("put", demand=demand, demanded=(Item(moved, ()),))
     (item,) = with_further_topics(put, ledger, config).demanded
     assert isinstance(item.held, Application)  # noqa: S101 - see above
