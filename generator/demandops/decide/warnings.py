@@ -127,11 +127,11 @@ def _unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
     services = (each for services in world.config.services.values() for each in services.values())
     patterns = {re.escape(each) for service in services for each in service.outputs.values()}
     could_be_output = re.compile("|".join(patterns).replace(r"\{instance\}", ".+")).fullmatch
+    outputs: dict[ClaimKey, dict[tuple[str, str], str]] = {}
     told = set[tuple[str, str]]()
     for _, input in held.all_inputs():
         if input.application or not could_be_output(input.topic):
             continue
-        place = (input.topic, input.source)
         makers = [
             claim
             for key in publishers(world, input.source, input.topic)
@@ -139,14 +139,16 @@ def _unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
         ]
         if not makers or any(claim.demand == demand for claim in makers):
             continue
-        app = makers[0].application
-        output = next(name for name, *at in _outputs_of(app, world.config) if (*at,) == place)
+        claim, app = makers[0], makers[0].application
+        if claim.key not in outputs:
+            outputs[claim.key] = _outputs_of(app, world.config)
+        output = outputs[claim.key].get((input.topic, input.source), "")
         if (app.id, output) not in told:  # a service may make thousands of topics
             told.add((app.id, output))
             yield (
                 f"application '{held.id}': {input.topic} of '{input.source}' is an output of "
-                f"application '{app.id}', which may end before this demand; to hold it, write "
-                f"{{application: {app.id}, output: {output}}} instead of the topic"
+                f"application '{app.id}', which may end before this demand; a Demand that names "
+                f"{{application: {app.id}, output: {output}}} instead of the topic holds it"
             )
 
 
@@ -157,23 +159,26 @@ def lost_output_notes(changes: Changes, after: World) -> Iterator[str]:
             continue
         app = change.before.application
         lost: dict[ClaimKey, str] = {}
-        for output, topic, node in _outputs_of(app, after.config):
+        for (topic, node), output in _outputs_of(app, after.config).items():
             reading = [each.key for each in after.ledger.each_reading(node, topic)]
             if reading and next(publishers(after, node, topic), None) is None:
-                lost |= dict.fromkeys(sorted(reading, key=str), f"{topic} of '{node}' ({output})")
-        for key, what in lost.items():
+                for key in reading:
+                    lost.setdefault(key, f"{topic} of '{node}' ({output})")
+        for key in sorted(lost, key=str):
             yield (
-                f"{key.subject} of demand '{key.demand}' still reads {what}, which application "
-                f"'{app.id}' no longer makes"
+                f"{key.subject} of demand '{key.demand}' still reads {lost[key]}, which "
+                f"application '{app.id}' no longer makes"
             )
 
 
-def _outputs_of(app: Application, config: Config) -> Iterator[tuple[str, str, str]]:
-    # (output, topic, node)
-    for service in config.services.get(app.appdef, {}).values():
-        for output in (f"{service.name}.{name}" for name in service.outputs):
-            for made in topics_of_origin(config, app, output):
-                yield output, made.topic.topic, made.node
+def _outputs_of(app: Application, config: Config) -> dict[tuple[str, str], str]:
+    # by topic and node
+    return {
+        (made.topic.topic, made.node): f"{service.name}.{name}"
+        for service in config.services.get(app.appdef, {}).values()
+        for name in service.outputs
+        for made in topics_of_origin(config, app, f"{service.name}.{name}")
+    }
 
 
 # ---- misspelled topics, which differ by a letter from a known topic of the node ----
