@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from itertools import groupby, islice, takewhile
 
 from demandops.base.errors import MOST_FAULTS, Fault, fault, suggestion
-from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, needed_access
@@ -18,7 +17,6 @@ from demandops.decide.checks.collisions import all_names, publishers
 from demandops.decide.placement.candidates import lacks, requirement_of, unmet
 from demandops.decide.placement.capacity import overcommitted, whole_usage
 from demandops.decide.placement.relocation import following_overrides, with_moves
-from demandops.decide.planning import chains
 from demandops.decide.planning.flows import flows, topics_of_origin
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.release_keys import claims_needing
@@ -27,7 +25,7 @@ from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.policy import AccessDomain, matches
 from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import Claim, ClaimKey, demand_id
+from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import Changes, World
 from demandops.templating import charts
 
@@ -58,7 +56,7 @@ def missing_inputs(world: World) -> list[MissingInput]:
         MissingInput(claim.application.id, claim_files.path_of(claim.key), reason)
         for claim in active.ledger
         if claim.is_on_application
-        for reason in (*_reasons(claim.application, active), *_changed_outputs(claim, active))
+        for reason in _reasons(claim.application, active)
     }
     return sorted(missing, key=lambda each: (each.application, each.reason, each.file))
 
@@ -69,6 +67,9 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
         if topic.source not in config.nodes:
             where = f"'{topic.source}' is not in the inventory"
             yield f"{role} {topic.topic} does not arrive: {where}"
+        elif topic.application and not any(publishers(active, topic.source, topic.topic)):
+            maker = f"application '{topic.application}' of '{topic.source}'"
+            yield f"{role} {topic.topic} does not arrive: {maker} does not make it"
     for flow in flows(config, app):
         sender = config.nodes.get(flow.sender)
         carried = active.ledger.is_carried_to(flow.receiver, flow.target)
@@ -91,25 +92,6 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
             )
 
 
-def _changed_outputs(claim: Claim, active: World) -> Iterator[str]:
-    app, ledger = claim.application, active.ledger
-    if not (read := app.read_outputs):
-        return
-    held = {
-        id
-        for id in read
-        if ledger.get(ClaimKey(Subject(SubjectKind.APPLICATION, id), claim.demand))
-    }
-    current = {*chains.followed(app, claim.demand, ledger, active.config).topic_keys()}
-    for role, topic in app.all_inputs():
-        is_current = (role, topic.topic, topic.source) in current and topic.application in held
-        if topic.application and not is_current:
-            yield (
-                f"{role} {topic.topic} of '{topic.source}' does not arrive: the demand no longer "
-                f"has it from application '{topic.application}'; put the demand again"
-            )
-
-
 # ---- outputs of applications that others read by the names of the topics alone ----
 #
 # The demand of such a reader does not hold the application, and is not asked when it ends.
@@ -127,28 +109,21 @@ def _unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
     services = (each for services in world.config.services.values() for each in services.values())
     patterns = {re.escape(each) for service in services for each in service.outputs.values()}
     could_be_output = re.compile("|".join(patterns).replace(r"\{instance\}", ".+")).fullmatch
-    outputs: dict[ClaimKey, dict[tuple[str, str], str]] = {}
     told = set[tuple[str, str]]()
     for _, input in held.all_inputs():
         if input.application or not could_be_output(input.topic):
             continue
-        makers = [
-            claim
-            for key in publishers(world, input.source, input.topic)
-            for claim in claims_needing(world, key)
-        ]
-        if not makers or any(claim.demand == demand for claim in makers):
-            continue
-        claim, app = makers[0], makers[0].application
-        if claim.key not in outputs:
-            outputs[claim.key] = _outputs_of(app, world.config)
-        output = outputs[claim.key].get((input.topic, input.source), "")
-        if (app.id, output) not in told:  # a service may make thousands of topics
-            told.add((app.id, output))
+        for key, output in publishers(world, input.source, input.topic):
+            claims = claims_needing(world, key)
+            maker = claims[0].subject.id
+            # a service may make thousands of topics, which are told once
+            if any(claim.demand == demand for claim in claims) or (maker, output) in told:
+                continue
+            told.add((maker, output))
             yield (
                 f"application '{held.id}': {input.topic} of '{input.source}' is an output of "
-                f"application '{app.id}', which may end before this demand; a Demand that names "
-                f"{{application: {app.id}, output: {output}}} instead of the topic holds it"
+                f"application '{maker}', which may end before this demand; a Demand that names "
+                f"{{application: {maker}, output: {output}}} instead of the topic holds it"
             )
 
 
@@ -157,28 +132,22 @@ def lost_output_notes(changes: Changes, after: World) -> Iterator[str]:
     for change in changes.claims:
         if change.before is None or not change.before.is_on_application or change.only_renews:
             continue
-        app = change.before.application
-        lost: dict[ClaimKey, str] = {}
-        for (topic, node), output in _outputs_of(app, after.config).items():
-            reading = [each.key for each in after.ledger.each_reading(node, topic)]
-            if reading and next(publishers(after, node, topic), None) is None:
-                for key in reading:
-                    lost.setdefault(key, f"{topic} of '{node}' ({output})")
+        app, lost = change.before.application, dict[ClaimKey, str]()
+        services = after.config.services.get(app.appdef, {}).values()
+        for output in (
+            f"{service.name}.{name}" for service in services for name in service.outputs
+        ):
+            for made in topics_of_origin(after.config, app, output):
+                place = made.node, made.topic.topic
+                reading = [claim.key for claim in after.ledger.each_reading(*place)]
+                if reading and not any(publishers(after, *place)):
+                    what = f"{made.topic.topic} of '{made.node}' ({output})"
+                    lost = dict.fromkeys(reading, what) | lost
         for key in sorted(lost, key=str):
             yield (
                 f"{key.subject} of demand '{key.demand}' still reads {lost[key]}, which "
                 f"application '{app.id}' no longer makes"
             )
-
-
-def _outputs_of(app: Application, config: Config) -> dict[tuple[str, str], str]:
-    # by topic and node
-    return {
-        (made.topic.topic, made.node): f"{service.name}.{name}"
-        for service in config.services.get(app.appdef, {}).values()
-        for name in service.outputs
-        for made in topics_of_origin(config, app, f"{service.name}.{name}")
-    }
 
 
 # ---- misspelled topics, which differ by a letter from a known topic of the node ----

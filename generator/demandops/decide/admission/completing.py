@@ -50,9 +50,10 @@ def completed(
 def placed(demand: AnyDemand, state: State) -> AnyDemand:
     """Return a demand, whose nodes are chosen, with all else that the generator adds."""
     config, ledger = state.config, state.ledger
-    # again, because the nodes of listed applications may have been open
-    demand, _ = chains.with_topics_of_outputs(demand, ledger, config)
-    demand = chains.with_held_applications(demand, ledger, config)
+    if chains.reads_outputs(demand):
+        # again, because the nodes of listed applications may have been open
+        demand, _ = chains.with_topics_of_outputs(demand, ledger, config)
+        demand = chains.with_held_applications(demand, ledger, config)
     demand = permission.with_lease_terms(demand, config)
     # clients of the reference list their connections, and later shut down just what they listed
     if not demand.is_reference:
