@@ -172,11 +172,10 @@ def with_held_applications(request: AnyDemand, ledger: Ledger, config: Config) -
     reading = [(i, i.held) for i in request.demanded if isinstance(i.held, Application)]
     for item, reader in reading:  # grows by what they hold
         for id, outputs in reader.read_outputs.items():
+            if id in listed:
+                continue
             readers.setdefault(id, {})[reader.id] = outputs
-            app = (
-                None if {id} & {*listed, *held} else _as_booked(id, request.demand, ledger, config)
-            )
-            if app:
+            if id not in held and (app := _as_booked(id, request.demand, ledger, config)):
                 held[id] = replace(item, needed_by="inputs"), app
                 reading.append(held[id])
     more = (replace(i, held=replace(app, held_for=readers[app.id])) for i, app in held.values())
