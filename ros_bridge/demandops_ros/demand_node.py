@@ -11,7 +11,7 @@ from datetime import datetime
 from functools import partial
 from typing import Any, TypeGuard
 
-from demandops.base.errors import DemandOpsError, NotReached, Unsound, Withdrawn
+from demandops.base.errors import DemandOpsError, InvalidInput, NotReached, Unsound, Withdrawn
 from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
 from demandops.cluster.health import Health, Level
@@ -306,12 +306,13 @@ class DemandNode(Node):  # type: ignore[misc]
             goal.ticket.journaled.add_done_callback(
                 lambda future: self._in_executor(partial(journaled.set_result, future.result()))
             )
-            if await journaled:
+            is_journaled = await journaled
+            error = None if is_journaled else goal.ticket.future.exception()
+            if is_journaled or isinstance(error, InvalidInput):
                 if len(self._goals) > _DEFAULT_DEPTH:  # not ==, because goals may come in bursts
                     self.get_logger().warning(_SHALLOW, once=True)
                 self.executor.create_task(self._forget_unless_accepted, goal)
                 return GoalResponse.ACCEPT
-            error = goal.ticket.future.exception()
             if isinstance(error, Unsound):  # send no answer: the process ends
                 await Future(executor=self.executor)
             self.get_logger().error(f"{goal} rejected: {one_line(str(error))}")

@@ -127,5 +127,5 @@ def test_the_bookkeeping_accepts_two_claims_that_a_person_made_inconsistent(
 def marked_further(app: Application) -> Application:
     inputs = app.inputs.items()
     return app.with_inputs(
-        {role: tuple(t._replace(further=True) for t in ts) for role, ts in inputs}
+        {role: tuple(replace(t, further=True) for t in ts) for role, ts in inputs}
     )

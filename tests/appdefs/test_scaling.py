@@ -16,7 +16,7 @@ from demandops.views.release_causes import override_report, warnings
 
 from tests.appdefs.test_recorder import ADDITIONS
 from tests.kit import plain_yaml
-from tests.kit.config import override, skeleton
+from tests.kit.config import edited, override, skeleton
 from tests.kit.memory import NOW, MemoryRepo
 
 ROOT = Path(__file__).parents[2]
@@ -40,6 +40,10 @@ def books(scaling: str, *, gitops: Literal["flux", "argocd"] = "flux", **files: 
     text = text.replace("parameters:\n", "parameters:\n  size: {default: small, merge: union}\n")
     assert scaling in text
     root = {"demandops.yaml": skeleton(gitops)["demandops.yaml"]}
+    domains = "policy/access-domains.yaml"  # a put may name other requesters than the one before
+    root[domains] = skeleton()[domains].replace(
+        '    nodes: ["*"]\n', '    nodes: ["*"]\n    rules: [{name: all, manages: ["*"]}]\n'
+    )
     return MemoryRepo({**ADDITIONS, **root, APPDEF: text, **files})
 
 
@@ -126,7 +130,9 @@ def test_a_change_of_requesters_replans_only_what_depends_on_them(
 ) -> None:
     select = {"requesters": selected, "services": ["driver"]}
     overrides = {"overrides/tested.yaml": override(select, replicas=0)} if selected else {}
-    repo = books(scaling, **overrides)
+    managing = "    rules: [{name: all, requesters: ['*'], manages: ['*']}]\n    namespace:"
+    policy = edited("policy/access-domains.yaml", "    namespace:", managing)
+    repo = books(scaling, **overrides, **policy)
     repo.send(demand(topics=3, requesters=requesters - 1))
     for count in (requesters, requesters - 1):
         before = repo.state

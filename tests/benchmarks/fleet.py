@@ -136,7 +136,7 @@ def _lay_down(path: Path, edges: int, vehicles: int, further: int) -> None:
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # no fsync for now
     tree = write_tree(repo, None, files)
     who = commit_message.generator_signature(now)
-    text = "A fleet\n\nOperation: init\nRender-Version: 2\n"
+    text = "A fleet\n\nOperation: init\nRender-Version: 3\n"
     repo.create_commit("refs/heads/main", who, who, text, tree, [])
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 

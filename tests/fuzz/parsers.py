@@ -231,7 +231,7 @@ def waiting_demand(data: bytes) -> None:
     record = records.read_waiting(_text(data), path)
     if record is not None:
         assert records.read_waiting(records.waiting_text(record), path) == record
-        goal_as_data(dict(record.goal))
+        goal_as_data(record.put.goal)
 
 
 # ---- files that only one person or one program reads ----

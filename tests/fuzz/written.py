@@ -39,7 +39,7 @@ from tests.kit import rich
 from tests.kit.config import state_of
 from tests.kit.memory import NOW, MemoryRepo
 from tests.kit.plain_yaml import FAST
-from tests.unit.ledger.test_claim_file import TRICKY, claims, joined_claims, values
+from tests.unit.ledger.test_claim_file import TRICKY, claims, values
 from tests.unit.ledger.test_claim_file import (
     test_every_claim_survives_its_file as claim_is_read_back,
 )
@@ -245,7 +245,7 @@ _IDS = st.lists(IDS, min_size=1, max_size=3, unique=True)
 TARGETS = (
     Target(text_in_yaml, values=TEXT),
     Target(value_in_yaml, values=values.filter(lambda value: not _value_problem(value, 0))),
-    Target(claim_in_its_file, values=claims | joined_claims()),
+    Target(claim_in_its_file, values=claims),
     Target(rendered_file, values=st.tuples(st.integers(), _TEXTS).map(_filled)),
     Target(override_by_command, values=st.tuples(TEXT, TEXT, _NODES, _PATCH)),
     Target(ledger_path, values=_PAIR),

@@ -12,7 +12,6 @@ import pytest
 from demandops.cli.main import run as run_command
 from demandops.model.config.override import format_time
 from demandops.model.ledger.claim import read
-from demandops.model.ledger.records import SHUTDOWNS_ROOT
 
 from tests.integration.conftest import On
 from tests.kit.cli import Ran, Run
@@ -215,7 +214,7 @@ class TestRollback:
         assert (ran.code, played.tip) == (1, before)
 
 
-FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 2\n"
+FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 3\n"
 Changed = dict[str, str | None]
 
 
@@ -270,9 +269,9 @@ class TestVerifyByDifferences:
             ("policy/access-domains.yaml", "join"),
             ("ledger/connections/00/x-0/y-0.yaml", "join"),
             ("overrides/a", "join"),
-            (f"{SHUTDOWNS_ROOT}/x.yaml", "put"),
+            ("ledger/overrides/x.yaml", "put"),
+            ("ledger/shutdowns/x.yaml", "put"),
             ("appdefs/object-detection-fusion/appdef.yaml", "upgrade"),
-            ("ledger/replicas/00/x.yaml", "upgrade"),
             ("claim", "join"),  # of the demand that the commit names, but with a comment
             ("claim", "follow"),  # of a demand that the commit does not name
         ],

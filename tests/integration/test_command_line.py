@@ -105,7 +105,7 @@ class TestRequest:
     def test_json_and_text_tell_the_outcome_of_each(
         self, on: On, demandops: Run, state: GitRepo, tmp_path: Path
     ) -> None:
-        asked = goal([application(), application("other")], shutdown=True)
+        asked = goal([application(), application("other")], id="r", shutdown=True)
         goals = goal([application()], id="r"), goal([application(node="egde")], id="s"), asked
         git(tmp_path, "clone", "-q", "--bare", str(state.path), "other.git")
         other = GitRepo(tmp_path / "other.git")
@@ -132,7 +132,7 @@ class TestRequest:
         log = git(other, "rev-list", "main").split()
         assert ran.out.splitlines() == [
             f"standard input: request 0 'r' booked in {log[1]}",
-            f"standard input: request 2 'request' released in {log[0]}",
+            f"standard input: request 2 'r' released in {log[0]}",
         ]
         assert ran.err.splitlines() == [
             f"  warning: {warning}",
@@ -193,7 +193,7 @@ class TestVerify:
     def test_what_was_tampered_with_does_not_hold(self, on: On, joined: GitRepo) -> None:
         (path,) = (path for path in joined.manifests() if "/od-" in path)
         changed = {path: joined.files()[path] + "# changed\n"}
-        joined.commit(changed, "Forged\n\nOperation: join\nRender-Version: 2\n", FORGER)
+        joined.commit(changed, "Forged\n\nOperation: join\nRender-Version: 3\n", FORGER)
         ran = on("verify")
         assert ran.code == 1
         assert ran.out.splitlines() == [
@@ -227,7 +227,7 @@ class TestStateRepo:
             assert not path.is_file() or "hunter2" not in path.read_text()
 
     def test_a_newer_generators_state_repo_is_refused(self, demandops: Run, state: GitRepo) -> None:
-        root = state.files()["demandops.yaml"].replace("renderVersion: 2", "renderVersion: 99")
+        root = state.files()["demandops.yaml"].replace("renderVersion: 3", "renderVersion: 99")
         newer = ("DemandOps generator", "generator@demandops.invalid", 1_770_000_000)
         before = state.commit({"demandops.yaml": root}, "Newer\n\nRender-Version: 99\n", newer)
         assert "update the generator" in self.refused(demandops, "request -", state.path)

@@ -1,17 +1,23 @@
-"""`demandops request` ends at once after Ctrl-C or SIGTERM, and says which demands are answered."""
+"""A command that Ctrl-C or SIGTERM interrupts says what is answered, and leaves nothing behind."""
 
 from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 from demandops.cli.main import run
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
+from tests.kit.limits import PATIENCE_S
+from tests.kit.rig import Person
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
@@ -48,3 +54,39 @@ def test_an_interrupted_request_says_which_demands_are_answered(
     assert signal.getsignal(signal.SIGTERM) is handler
     assert rig.restart(bare) is True
     assert 60 - unsent - 1 <= len(rig.operations(bare)) <= 60 - unsent
+
+
+def test_an_interrupt_of_the_first_request_says_that_it_has_no_answer(
+    bare: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "demand.yaml"
+    file.write_text(yaml.safe_dump(rig.goal(1)))
+    submit = Generator.submit
+
+    def interrupted(generator: Generator, *arguments: Any, **more: Any) -> None:
+        submit(generator, *arguments, **more)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Generator, "submit", interrupted)
+    assert run(["request", str(file), "--state-repo", str(bare)]) == 130
+    told = capfd.readouterr().err
+    assert " has no answer yet" in told and "0 of 1 requests have an answer" in told
+
+
+def test_an_interrupted_check_leaves_no_folder(person: Person, tmp_path: Path) -> None:
+    helm, scratch, started = tmp_path / "helm", tmp_path / "scratch", tmp_path / "started"
+    helm.write_text(f"#!/bin/sh\ntouch {started}\nexec sleep 600\n")
+    helm.chmod(0o755)
+    scratch.mkdir()
+    person.fetch()
+    chart = person.folder / "appdefs/object-detection-fusion/charts/object-fusion/values.yaml"
+    chart.write_text(chart.read_text() + "# a new chart is rendered\n")
+    command = [sys.executable, "-m", "demandops.cli.main", "check", str(person.folder)]
+    environment = {**os.environ, "HELM_BIN": str(helm), "TMPDIR": str(scratch)}
+    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    rig.wait_until(started.exists, "helm runs")
+    assert [path.name[:15] for path in scratch.iterdir()] == ["demandops-helm-"]
+    process.send_signal(signal.SIGTERM)
+    _, told = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, "interrupted" in told) == (130, True)
+    assert list(scratch.iterdir()) == []

@@ -116,7 +116,7 @@ def test_what_is_more_than_demands_is_listed_and_no_name_of_a_file_adds_lines(
     (person.folder / "notes\n  + service harmless").write_text("text\n")
     git(person.folder, "add", "--all")
     by = {"GIT_COMMITTER_NAME": GENERATOR_NAME, "GIT_COMMITTER_EMAIL": GENERATOR_EMAIL}
-    message = 'Put\n\nRequester: "a\\n  + nothing"\nProposal: x\nRender-Version: 2\n'
+    message = 'Put\n\nRequester: "a\\n  + nothing"\nProposal: x\nRender-Version: 3\n'
     git(person.folder, "commit", "--quiet", "--message", message, **by)
     git(person.folder, "push", "--quiet", "origin", f"HEAD:{branch}")
     with Dialogue("approve", branch, "--state-repo", strict.path) as asked:

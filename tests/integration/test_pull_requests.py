@@ -85,14 +85,14 @@ def newer_images(branch: Path) -> None:
     edit(branch / "registry" / "images.yaml", *NEWER_PERCEPTION)
 
 
-def claim(folder: Path, needle: str = "kind: ApplicationClaim") -> Path:
+def claim(folder: Path, needle: str = "\napplication:\n") -> Path:
     files = sorted((folder / "ledger").rglob("*.yaml"))
     (found,) = [path for path in files if needle in path.read_text()]
     return found
 
 
 def delete_a_claim(branch: Path) -> None:
-    claim(branch, "connection: vehicle00/edge").unlink()
+    claim(branch, "connection:\n  id: vehicle00/edge").unlink()
 
 
 def with_requesters(branch: Path, names: list[str]) -> None:
@@ -176,9 +176,9 @@ def test_a_symbolic_link_is_not_followed(branch: Path, tmp_path: Path, found: Fo
 def test_the_check_of_another_render_version_says_so(
     check: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checking, "RENDER_VERSION", 3)
+    monkeypatch.setattr(checking, "RENDER_VERSION", 4)
     told = check().err
-    assert told.startswith("error: demandops.yaml:15: renderVersion: is 2, but this program ")
+    assert told.startswith("error: demandops.yaml:15: renderVersion: is 3, but this program ")
 
 
 # ---- branches ----

@@ -96,10 +96,12 @@ def test_check_and_upgrade_name_the_faults_on_main(
 
 
 def test_a_generator_publishes_the_journal_once_and_keeps_the_proposal_open(
-    on: On, state: GitRepo, journal: Path, clock: Clock
+    on: On, state: GitRepo, person: Person, journal: Path, clock: Clock
 ) -> None:
     proposal, pending = FACTS["proposal"], sorted(FACTS["pending"].values())
     assert read(journal).keys() == {proposal["operation"], *pending}
+    mend(state, person)
+    assert on("upgrade").code == 0
     for _ in range(2):
         with running(state.path, runtime=clock):
             wait_until(lambda: read(journal).keys() == {proposal["operation"]}, "all is published")
@@ -107,19 +109,27 @@ def test_a_generator_publishes_the_journal_once_and_keeps_the_proposal_open(
     assert sorted(published) == pending
     (shown,) = on("get", "proposals", "--output", "json").json()["items"]
     assert shown["branch"] == proposal["branch"]
-    held = {file["demand"] for file in ledger(state) if file["kind"].endswith("Claim")}
+    held = {file["demand"] for file in ledger(state) if file["kind"] == "Claim"}
     assert held & {"visit", "pending-put", "closed"} == {"pending-put"}
     assert_verified(on, FACTS["main"])
 
 
-def test_when_people_have_mended_main_all_is_valid_and_an_upgrade_has_nothing_to_do(
+def test_an_upgrade_takes_every_claim_and_waiting_demand_along(
     demandops: Run, on: On, state: GitRepo, person: Person, clock: Clock, tmp_path: Path
 ) -> None:
     mend(state, person)
-    with running(state.path, runtime=clock, fetch_interval=0.05):
-        wait_until(lambda: not state.files(".demandops/reports/"), "the report is gone")
-    assert state.files("overrides/two-at-the-edge.yaml")
+    before = on("bookkeeping", "--output", "json").json()
+    manifests = state.manifests()
+    assert on("upgrade").code == 0
+    after = on("bookkeeping", "--output", "json").json()
+    assert after | {"commit": ""} == before | {"commit": ""}
+    kinds = Counter((file["kind"], file["apiVersion"]) for file in ledger(state))
+    assert {version for _, version in kinds} == {"demandops.ledger/v3"}
+    assert {kind for kind, _ in kinds} == {"Claim", "WaitingDemand", "EndedOverride"}
+    assert {*state.manifests()} == {*manifests}
     git(tmp_path, "clone", "--quiet", str(state.path), "clone")
     assert demandops("check", tmp_path / "clone").code == 0
+    with running(state.path, runtime=clock, fetch_interval=0.05):
+        wait_until(lambda: not state.files(".demandops/reports/"), "the report is gone")
     assert "nothing to do" in on("upgrade").out
     assert_verified(on, FACTS["main"])

@@ -288,7 +288,7 @@ class TestVerify:
     ) -> None:
         forger = keygen(tmp_path / "forger")
         state.commit({SIGNERS: listed(key)})
-        forged = "Forged\n\nOperation: join\nRender-Version: 2\n"
+        forged = "Forged\n\nOperation: join\nRender-Version: 3\n"
         state.commit({SIGNERS: listed(forger)}, forged, FORGER)
         for signs, told in ((None, "is not signed, but "), (forger, "is signed, but not by a key")):
             if signs:

@@ -34,11 +34,11 @@ PARTS = ("generator", "ros_bridge", "templates", "appdefs", "state-repo-skeleton
 ROOT_FILE = "demandops.yaml"
 URL = "https://git.example/fleet/state-repo.git"
 OLDER = (
-    "demandops.yaml: renderVersion: is 2, but this generator renders version 3; stop older "
+    "demandops.yaml: renderVersion: is 3, but this generator renders version 4; stop older "
     "generators, then run `demandops upgrade` to render everything again"
 )
 NEWER = (
-    "demandops.yaml: renderVersion: is 3, but this generator renders version 2; update the "
+    "demandops.yaml: renderVersion: is 4, but this generator renders version 3; update the "
     "generator"
 )
 
@@ -61,12 +61,12 @@ for line in commands:
 
 @pytest.fixture(scope="session")
 def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subprocess.Popen[str]]:
-    """A process that runs commands of a program with render version 3 and another time-out."""
+    """A process that runs commands of a program with render version 4 and another time-out."""
     folder = tmp_path_factory.mktemp("newer")
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
     for path, old, new in (
-        ("generator/demandops/base/settings.py", "RENDER_VERSION = 2\n", "RENDER_VERSION = 3\n"),
+        ("generator/demandops/base/settings.py", "RENDER_VERSION = 3\n", "RENDER_VERSION = 4\n"),
         ("templates/flux/release.yaml.j2", "timeout: 5m", "timeout: 6m"),
     ):
         text = (folder / path).read_text()
@@ -200,19 +200,19 @@ def test_a_newer_program_serves_only_after_an_upgrade_and_the_older_only_before(
         assert newer("request", "-", *dry, stdin=goal) == (1, "", f"error: {OLDER}\n")
     assert newer("bookkeeping").code == 0
     assert [row["skipped"] for row in newer("verify", "--output", "json").json()] == [
-        "rendered by version 2, but this program renders version 3"
+        "rendered by version 3, but this program renders version 4"
     ]
     assert state.tip == before
 
     old = state.files()
     ran = newer("upgrade")
     assert (ran.code, ran.err) == (0, "")
-    assert ran.out.endswith(f"render version 2 → 3\nin commit {state.tip}\n")
+    assert ran.out.endswith(f"render version 3 → 4\nin commit {state.tip}\n")
     new = state.files()
     changed = {path for path in new if new[path] != old.get(path)}
     assert {path.rsplit("/", 1)[-1][:3] for path in changed} == {"dem", "od-", "of-"}
-    assert new[ROOT_FILE] == old[ROOT_FILE].replace("renderVersion: 2", "renderVersion: 3")
-    assert "From-Render-Version: 2\nGitops: flux\nRender-Version: 3\n" in state.commits()[0]
+    assert new[ROOT_FILE] == old[ROOT_FILE].replace("renderVersion: 3", "renderVersion: 4")
+    assert "From-Render-Version: 3\nGitops: flux\nRender-Version: 4\n" in state.commits()[0]
     assert all(row["holds"] for row in newer("verify", "--output", "json").json())
     assert "nothing to do" in newer("upgrade").out
 
@@ -253,4 +253,4 @@ def test_an_upgrade_that_is_reverted_gives_the_repo_back_to_the_older_program(
 def test_a_newer_program_lays_down_a_repo_of_its_own_version(newer: Run, tmp_path: Path) -> None:
     folder = tmp_path / "fleet"
     assert newer("init", str(folder)).code == 0
-    assert "renderVersion: 3\n" in (folder / ROOT_FILE).read_text()
+    assert "renderVersion: 4\n" in (folder / ROOT_FILE).read_text()

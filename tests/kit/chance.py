@@ -14,8 +14,8 @@ from typing import Any
 from hypothesis import HealthCheck, Phase, note, settings
 from hypothesis import strategies as st
 
-from tests.model.books import Goal
 from tests.model.goals import summary
+from tests.model.listed import Goal
 
 IN_FULL = "DEMANDOPS_EXAMPLES" in os.environ
 TIMES = int(os.environ.get("DEMANDOPS_EXAMPLES", "1"))

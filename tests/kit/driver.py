@@ -24,6 +24,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+from demandops.model.demand.goals import read_journaled
 from demandops.repo.git.local_repository import LocalRepository
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.write.commit_batch import CommitBatch
@@ -90,6 +91,12 @@ def arm(where: str, address: str) -> None:
         setattr(owner, name, around(getattr(owner, name)))
 
 
+def demand_of(goal: Any) -> Any:
+    """Return a rollback as the demand that the command makes, and any other goal as it is."""
+    is_rollback = isinstance(goal, dict) and goal.get("kind") == "Rollback"
+    return read_journaled(goal) if is_rollback else goal
+
+
 class Lanes:
     """Clients; one marked ``withdraw`` is withdrawn once a demand of any lane is admitted."""
 
@@ -122,7 +129,7 @@ class Lanes:
         if lane[index].get("withdraw"):
             self._to_withdraw.append(lane[index])
         ticket = self._generator.submit(
-            lane[index]["goal"],
+            demand_of(lane[index]["goal"]),
             lane[index]["operation"],
             lambda stage, text: self._take_back() if stage == "admitted" else None,
         )
@@ -158,7 +165,7 @@ def run(plan: dict[str, Any]) -> None:
     if opening := plan["opening"]:
         tell(sent=opening["name"])
         ticket = generator.submit(
-            opening["goal"],
+            demand_of(opening["goal"]),
             opening["operation"],
             lambda stage, text: lanes.start() if stage == "admitted" else None,
         )

@@ -90,17 +90,15 @@ def perception(**changed: Any) -> Goal:
     return goal([application()], [connection()]) | changed
 
 
-def numbered(
-    number: int, *, shutdown: bool = False, vehicle: int | None = None, alone: bool = False
-) -> Goal:
+def numbered(number: int, *, shutdown: bool = False, vehicle: int | None = None) -> Goal:
     """Return demand ``number``.
 
-    Its requesters are ``user<number>``, who has no other demand, and ``station00``. If ``alone``,
-    ``station00`` is left out. Demands 0, 5, 10, … have the same application. Without ``vehicle``,
-    demands 0, 4, 8, … have the same connection.
+    Its requesters are ``user<number>``, who has no other demand, and ``station00``. Demands 0, 5,
+    10, … have the same application. Without ``vehicle``, demands 0, 4, 8, … have the same
+    connection.
     """
     name = f"vehicle{(number if vehicle is None else vehicle) % 4:02}"
-    who = [f"user{number}", *([] if alone else ["station00"])]
+    who = [f"user{number}", "station00"]
     ego = (f"/vehicles/{name}/ego_data", name)
     app = application(f"edge/fusion-{number % 5}", who=who, ego=[ego], clouds=[STATION_CLOUD])
     link = connection(f"{name}/edge", who=who, ends=(name, "edge"), topics=[ego[0]])

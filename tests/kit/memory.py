@@ -29,7 +29,7 @@ from tests.kit import plain_yaml
 from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.goals import Goal
 from tests.kit.plain_yaml import FAST
-from tests.model.books import in_model_words, object_lists
+from tests.model.view import in_model_words, object_lists
 
 NOW = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
 
@@ -131,7 +131,7 @@ class MemoryRepo:
         return {"services": data["services"], "connections": data["connections"]}
 
     def view(self) -> dict[str, Any]:
-        """Return the bookkeeping in the form of ``tests.model.books``."""
+        """Return the bookkeeping in the form of ``tests.model.view``."""
         return in_model_words(self.bookkeeping(), object_lists(self.below("clusters").values()))
 
     def below(self, *roots: str) -> dict[str, str]:

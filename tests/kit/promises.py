@@ -137,6 +137,5 @@ def claims_of(ledger: Iterable[Claim]) -> dict[Name, tuple[dict[str, Any], froze
         else:
             topics = {route.source: route.target for route in held.topics}
             what = {"source": held.source, "target": held.target, "topics": topics}
-            what["holds"] = {one: frozenset(claim.holders((one,))) for one in topics}
         found[name_of(claim)] = what, frozenset(claim.requesters)
     return found

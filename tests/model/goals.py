@@ -24,7 +24,7 @@ from tests.kit.goals import (
     goal,
     input_topic,
 )
-from tests.model.books import World, requesters
+from tests.model.listed import World, requesters
 
 T = TypeVar("T")
 
@@ -34,6 +34,7 @@ PARTIES = (*VEHICLES, STATION)
 
 SKELETON = World(nodes=frozenset({*PARTIES, "edge", "cloud"}), brokers=frozenset({"edge", "cloud"}))
 
+DEMANDS = ("d", "D/1", "again")
 REQUESTS = ("station00/collective-perception-intersection", "again", "")
 
 APPLICATIONS = {
@@ -83,9 +84,11 @@ def shutdown_of(joined: Goal) -> Goal:
 class Maker:
     """Makes random requests; those of a ``calm`` maker never contradict each other."""
 
-    def __init__(self, random: Random, *, calm: bool = False) -> None:
+    def __init__(self, random: Random, *, calm: bool = False, both: bool = False) -> None:
+        """With ``both``, requests are in the form of our own action as well."""
         self._random = random
-        self.calm = calm
+        self.calm, self.both = calm, both
+        self.puts: list[Goal] = []
         self.joined: list[Goal] = []
         self.left: list[Goal] = []
 
@@ -93,6 +96,8 @@ class Maker:
         return [self.any() for _ in range(length)]
 
     def any(self) -> Goal:
+        if self.both and self._odds(4):
+            return self.own()
         if not self.joined or self._random.randrange(2) == 0:
             return self.join()
         if self._odds(6):
@@ -156,6 +161,28 @@ class Maker:
             more = self._pick(self.joined)
             made["apps"] += deepcopy(more["apps"])
             made["connections"] += deepcopy(more["connections"])
+        return made
+
+    def own(self) -> Goal:
+        """Return a put, renewal or release of a ``Demand``; some repeat a put, or are of others."""
+        if self.puts and self._odds(2):
+            made = self._pick(self.puts)
+            if self._odds(2):
+                return made
+            end = {name: made[name] for name in ("kind", "demand", "requesters")}
+            end["operation"] = self._pick(["release", "release", "renew"])
+            return end | ({"requesters": self._people()} if self._odds(4) else {})
+        people = self._people()
+        apps = [self._application(people) for _ in range(self._random.randrange(2))]
+        links = [self._connection(people)] if not apps or self._odds(2) else []
+        made = {
+            "kind": "Demand",
+            "demand": self._pick(DEMANDS),
+            "requesters": people,
+            "applications": [_own_application(app) for app in apps],
+            "connections": [_own_connection(link) for link in links],
+        }
+        self.puts.append(made)
         return made
 
     # Parts
@@ -271,6 +298,30 @@ class Maker:
 
     def _odds(self, against: int) -> bool:
         return self._random.randrange(against) == against - 1
+
+
+def _own_application(app: Item) -> Item:
+    body = app["object_detection_fusion_app"]
+    fields = {"ego_data": "ego_data_topics", "point_cloud": "pointcloud_topics"}
+    inputs = {
+        role: [{"topic": t["topic_name"], "source": t["source_node_id"]} for t in body[field]]
+        for role, field in fields.items()
+        if body[field]
+    }
+    place = {"id": app["header"]["id"], "node": app["header"]["node_id"], "connect": "none"}
+    return place | {"type": "object-detection-fusion", "inputs": inputs}
+
+
+def _own_connection(item: Item) -> Item:
+    pairs = zip(item["source_topics"], item["target_topics"], strict=True)
+    made = {
+        "id": item["id"],
+        "type": "mqtt",
+        "source": item["source_node_id"],
+        "target": item["target_node_id"],
+        "topics": [{"source": source, "target": target} for source, target in pairs],
+    }
+    return made | ({"broker": item["broker_node_id"]} if item["broker_node_id"] else {})
 
 
 def summary(made: Goal) -> dict[str, Any]:

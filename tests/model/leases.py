@@ -6,7 +6,7 @@ docs leave something open, a comment says what this model does. Times are whole 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -19,8 +19,6 @@ Subject = tuple[str, str]
 BY_MESSAGE = "by message: "
 """Begins the name of a demand by a ``DeploymentRequest`` goal."""
 
-REPEATS_WITHIN_S = 15 * 60
-
 
 def name_by_message(request: str, who: Iterable[str]) -> str:
     return f"{BY_MESSAGE}{request} {sorted(who)}"
@@ -28,42 +26,27 @@ def name_by_message(request: str, who: Iterable[str]) -> str:
 
 @dataclass
 class Held:
-    """The hold of a demand on a subject.
-
-    ``promised`` is the last renewal plus the lease of ``seconds``; ``holders``, ``request`` and
-    ``booked`` belong to a ``DeploymentRequest`` goal.
-    """
+    """The claim of a demand on a subject; ``promised`` is the last renewal plus ``seconds``."""
 
     what: dict[str, Any]
     requesters: frozenset[str]
     seconds: int | None = None
     promised: int | None = None
-    request: str = ""
-    holders: dict[str, frozenset[str]] = field(default_factory=dict)
-    booked: int = 0
 
     def same(self, other: Held | None) -> bool:
         if other is None:
             return False
-        mine = (self.what, self.requesters, self.seconds, self.holders)
-        return mine == (other.what, other.requesters, other.seconds, other.holders)
-
-    def holds(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return who holds each topic of a connection: all, unless ``holders`` names some."""
-        topics = self.what.get("topics")
-        return {"holds": dict.fromkeys(topics, self.requesters) | self.holders} if topics else {}
+        mine = (self.what, self.requesters, self.seconds)
+        return mine == (other.what, other.requesters, other.seconds)
 
 
 @dataclass
 class Promises:
-    """Each demand's holds, which may go ``slack`` seconds after the end of their lease."""
+    """Each demand's claims, which may go ``slack`` seconds after the end of their lease."""
 
     slack: int
     default: int | None = None
     held: dict[str, dict[Subject, Held]] = field(default_factory=dict)
-    shutdowns: dict[tuple[str, frozenset[str], Subject, frozenset[str]], int] = field(
-        default_factory=dict
-    )
 
     def take(self, goal: Goal, now: int) -> Outcome:
         """Apply or refuse a goal as a whole.
@@ -73,16 +56,15 @@ class Promises:
         """
         if goal.get("kind") == "Demand":
             return self._own(goal, now)
-        return self._message(goal, now)
+        return self._message(goal)
 
     # demands in our own format
 
     def _own(self, goal: Goal, now: int) -> Outcome:
         demand, who = goal["demand"], frozenset(goal["requesters"])
         standing = self.held.get(demand, {})
-        owners = {one for held in standing.values() for one in held.requesters}
         operation = goal.get("operation", "put")
-        if not who or (owners and not owners & who):
+        if not who or any(held.requesters != who for held in standing.values()):
             return "refused"
         if operation == "put":
             return self._put(demand, who, goal, now)
@@ -133,73 +115,36 @@ class Promises:
 
     # DeploymentRequest goals: each has one connection; its id and requesters name the demand
 
-    def _message(self, goal: Goal, now: int) -> Outcome:
+    def _message(self, goal: Goal) -> Outcome:
         item = goal["connections"][0]
         who = frozenset(item["requester_ids"])
         subject = ("connections", item["id"])
         routes = dict(zip(item["source_topics"], item["target_topics"], strict=True))
         if goal.get("shutdown"):
-            return self._shut_down(goal["id"], who, subject, frozenset(routes), now)
+            return self._shut_down(name_by_message(goal["id"], who), subject, routes)
         ends = {"source": item["source_node_id"], "target": item["target_node_id"]}
         if self._contradicts("", subject, {**ends, "topics": routes}):
             return "refused"
         demand = name_by_message(goal["id"], who)
-        was = self.held.get(demand, {}).get(subject, Held(ends | {"topics": {}}, frozenset()))
-        holders = {one: was.holders.get(one, frozenset()) | who for one in routes}
-        held = Held(
-            ends | {"topics": was.what["topics"] | routes},
-            was.requesters | who,
-            request=goal["id"],
-            holders=was.holders | holders,
-            booked=now,
-        )
+        was = self.held.get(demand, {}).get(subject, Held(ends | {"topics": {}}, who))
+        held = Held(ends | {"topics": was.what["topics"] | routes}, who)
         if held.same(was):
             return "unchanged"
         self.held.setdefault(demand, {})[subject] = held
-        self.shutdowns = {one: at for one, at in self.shutdowns.items() if not one[1] & who}
         return "booked"
 
-    def _shut_down(
-        self, request: str, who: frozenset[str], subject: Subject, topics: frozenset[str], now: int
-    ) -> Outcome:
-        this = (request, who, subject, topics)
-        if this in self.shutdowns and abs(now - self.shutdowns[this]) <= REPEATS_WITHIN_S:
-            return "unchanged"
-        own = name_by_message(request, who)
-        around = [
-            (name != own, held[subject].request != request, held[subject].booked, name)
-            for name, held in self.held.items()
-            if name.startswith(BY_MESSAGE) and subject in held
-        ]
-        names = [name for *_, name in sorted(around)]
-        # no two requesters share a hold, so it does not matter whose holds are taken first
-        taken = [self._take(names, one, subject, topics) for one in who]
-        if not any(taken):
+    def _shut_down(self, demand: str, subject: Subject, topics: Collection[str]) -> Outcome:
+        held = self.held.get(demand, {}).get(subject)
+        if held is None:
             return "refused"
-        self.shutdowns[this] = now
+        routes = held.what["topics"]
+        left = {one: to for one, to in routes.items() if topics and one not in topics}
+        if left == routes:
+            return "refused"
+        held.what["topics"] = left
+        if not left:
+            self._drop(demand, subject)
         return "released"
-
-    def _take(self, names: list[str], one: str, subject: Subject, topics: frozenset[str]) -> bool:
-        theirs = [
-            (name, held)
-            for name in names
-            if (held := self.held.get(name, {}).get(subject)) and one in held.requesters
-        ]
-        listed = topics or frozenset(*[held.holders for _, held in theirs[:1]])
-        has_taken = False
-        for topic in listed:
-            holding = ((n, held) for n, held in theirs if one in held.holders.get(topic, ()))
-            name, held = next(holding if topics else iter(theirs), ("", Held({}, frozenset())))
-            if not name:
-                continue
-            has_taken = True
-            held.holders[topic] -= {one}
-            if not held.holders[topic]:
-                del held.holders[topic], held.what["topics"][topic]
-            held.requesters = frozenset().union(*held.holders.values())
-            if not held.holders:
-                self._drop(name, subject)
-        return has_taken
 
     def _drop(self, demand: str, subject: Subject) -> None:
         del self.held[demand][subject]
@@ -209,7 +154,7 @@ class Promises:
     # time
 
     def may_go(self, now: int) -> set[tuple[str, Subject]]:
-        """Return the holds whose leases are over at ``now``; the generator may release them."""
+        """Return the claims whose leases are over at ``now``; the generator may release them."""
         return {
             (demand, subject)
             for demand, subjects in self.held.items()
@@ -218,7 +163,7 @@ class Promises:
         }
 
     def must_go(self, now: int) -> set[tuple[str, Subject]]:
-        """Return the holds that a check must release at ``now``, because their slack is over."""
+        """Return the claims that a check must release at ``now``, because their slack is over."""
         return self.may_go(now - self.slack)
 
     def gone(self, released: Iterable[tuple[str, Subject]]) -> None:
@@ -229,7 +174,7 @@ class Promises:
 
     def claims(self) -> dict[tuple[str, Subject], tuple[dict[str, Any], frozenset[str]]]:
         return {
-            (demand, subject): (deepcopy(held.what) | held.holds(), held.requesters)
+            (demand, subject): (deepcopy(held.what), held.requesters)
             for demand, subjects in self.held.items()
             for subject, held in subjects.items()
         }

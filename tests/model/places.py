@@ -44,7 +44,7 @@ class Places(Promises):
         demand, who = goal.get("demand", ""), frozenset(goal.get("requesters", ()))
         waits = self.waiting.get(demand)
         if waits and goal.get("operation", "put") != "put":
-            if not who & waits.who:
+            if who != waits.who:
                 return "refused"
             if goal["operation"] == "renew":
                 return "unchanged"
@@ -55,7 +55,7 @@ class Places(Promises):
         standing = self.held.get(demand)
         if standing is not None:
             return self._put_again(goal, now, next(iter(standing.items())))
-        if waits and not who & waits.who:
+        if waits and who != waits.who:
             return "refused"
         if self.free():
             first = min(self.waiting, key=self._turn, default=demand)
@@ -72,7 +72,7 @@ class Places(Promises):
         """Apply a put to a demand that has a node, where it stays unless the node is drained."""
         subject, what = held
         node = what.what["node"]
-        if not what.requesters & {*goal["requesters"]}:
+        if what.requesters != {*goal["requesters"]}:
             return "refused"
         if node in self.drained:
             if not self.free():

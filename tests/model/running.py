@@ -89,7 +89,7 @@ class Running(Instances):
 
     def _holds(self, connections: set[str]) -> dict[Any, Any]:
         return {
-            (demand, subject): (dict(held.what), held.requesters, dict(held.holders))
+            (demand, subject): (dict(held.what), held.requesters)
             for demand, subject, held in self._each("connections")
             if subject in connections
         }

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -46,6 +48,18 @@ def record(path: Path, plugin: StoragePlugin) -> None:
         for time, away in distances.items()
     ]
     write_bag(path, sorted(poses), plugin, [(START_S, "/vehicles/tram/pose", "ding")])
+
+
+def test_a_replay_needs_no_ros(tmp_path: Path) -> None:
+    record(tmp_path / "bag", StoragePlugin.MCAP)
+    without = "import sys; sys.modules['rclpy'] = None; from demandops.cli.main import main; main()"
+    for further, code, told in (
+        (["--replay", str(tmp_path / "bag")], 0, "vehicle00"),
+        ([], 1, "detect needs rclpy, which is not installed"),
+    ):
+        command = [sys.executable, "-c", without, "detect", str(RULES), *further]
+        ran = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (ran.returncode, told in ran.stdout + ran.stderr) == (code, True), ran.stderr
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)

@@ -279,7 +279,7 @@ def _take(step: Step, world: World, place: str) -> None:
         taken = world.take(step.send)
         for problem in _sent(step, taken):
             raise AssertionError(f"{place}: {problem}")
-        if isinstance(taken, Decision) and taken.frees:
+        if isinstance(taken, Decision) and taken.awaited:
             world.book_waiting()
     compared = {
         "runs": world.runs,

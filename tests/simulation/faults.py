@@ -102,21 +102,35 @@ def in_reverse(right: Wrong, *given: Any) -> Any:
 # ---- booking ----
 
 
-@wrong(7, booking, "book")
-def keep_former_requesters(
-    book: Any, ledger: Any, one: Any, request: str, key: Any, current: Any, *more: Any, **named: Any
-) -> Any:
-    former = current.requesters if current else ()
-    one = replace(one, requesters=(*one.requesters, *former))
-    return book(ledger, one, request, key, current, *more, **named)
-
-
-plant("let_strangers_change_a_demand", 1, booking, "refuse_other_owners", nothing)
-plant("release_only_the_first_claim", 17, booking, "owned_claims", first_only)
+plant("let_strangers_change_a_demand", 1, permission, "stranger_faults", lambda *_: ())
+plant("release_only_the_first_claim", 47, booking, "claims_of", first_only)
 plant("replace_what_was_joined", 2, Claim, "extending", itself)
 plant("commit_what_is_booked_already", 15, Claim, "after_booking", itself)
 plant("grant_one_claim_too_many", 4, quotas, "_held", lambda held, *given: held(*given) - 1)
-plant("take_a_repeat_for_another_shutdown", 16, RecentShutdowns, "earlier", nothing)
+
+
+@wrong(16, booking, "shut_down")
+def let_a_shutdown_end_any_join_of_its_request(shut_down: Any, ledger: Any, asked: Any) -> Any:
+    """Find a claim by the request id and one of the requesters."""
+    made = []
+    for item in asked.demanded:
+        claims = [c for c in ledger.claims_on(item.held.subject) if c.request == asked.id]
+        meant = [c for c in claims if c.joined and {*c.requesters} & {*item.requesters}]
+        made.append(replace(item, requesters=meant[0].requesters) if meant else item)
+    return shut_down(ledger, replace(asked, demanded=tuple(made)))
+
+
+@wrong(1, permission, "stranger_faults")
+def take_one_common_requester_for_the_owner(
+    faults: Any, request: Any, owners: Any, *more: Any
+) -> Any:
+    owners = {*owners}
+    return () if owners & {*request.requesters()} else faults(request, owners, *more)
+
+
+@wrong(0, Claim, "without_topics")
+def end_the_whole_claim_by_a_shutdown_of_some_topics(_: Any, claim: Any, gone: Any) -> None:
+    return None
 
 
 @wrong(5, Lease, "renewed")
@@ -164,7 +178,7 @@ def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: An
 plant("take_the_first_domain", 1, Config, "nodes_of", lambda _, config, node: (node,))
 
 
-@wrong(100, completing, "_chosen")
+@wrong(22, completing, "_chosen")
 def forget_what_is_booked_in_a_domain(chosen: Any, one: Any, booked: Any, *more: Any) -> Any:
     return chosen(one, {}, *more)
 
@@ -324,7 +338,7 @@ def bring_back_what_was_deleted(
     if files:
         author = batch._objects[advance.snapshot.commit].author
         state = replace(batch.head.state, ledger=ledger)
-        batch.commit_files(files, state, "Undo\n\nRender-Version: 2\n", author, now)
+        batch.commit_files(files, state, "Undo\n\nRender-Version: 3\n", author, now)
 
 
 @wrong(0, Approvals, "_receipt")
@@ -333,7 +347,7 @@ def book_again_what_was_approved(
 ) -> Receipt:
     if isinstance(decision, Decision):
         batch = CommitBatch(made._repository, snapshot)
-        text = f"Again\n\nOperation-Id: {ticket.operation}\nRender-Version: 2\n"
+        text = f"Again\n\nOperation-Id: {ticket.operation}\nRender-Version: 3\n"
         author = batch._objects[snapshot.commit].author
         batch.commit_files(decision.files, decision.state, text, author, made._runtime.now())
         batch.publish()

@@ -160,9 +160,11 @@ class History:
         if puts and self.chance.randrange(3):  # mostly the same demand again
             (app,) = puts[-1]["applications"]
             return puts[-1] | {"applications": [app | {"inputs": inputs}]}
-        names = ["traffic", "vehicle01", "vehicle01", "vehicle01", "vehicle00"]
-        who = sorted({self.chance.choice(names), self.chance.choice(names)})
-        made = _named(f"tally{self.chance.randrange(2)}", who)
+        number, names = self.chance.randrange(3), ["traffic", "vehicle01", "vehicle01", "vehicle00"]
+        who = [["vehicle01"], ["vehicle01"], ["traffic", "vehicle01"]][number]
+        if not self.chance.randrange(3):  # others, who may change nothing of these
+            who = sorted({self.chance.choice(names), self.chance.choice(names)})
+        made = _named(f"tally{number}", who)
         if puts and not self.chance.randrange(3):
             return made | {"operation": self.chance.choice(["release", "renew"])}
         app = _fusion(

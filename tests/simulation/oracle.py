@@ -246,6 +246,8 @@ class Oracle:
             # a machine that saw a jump grants every lease its full term from the jump on
             full_term = jump + held.seconds if started < jump else jump
             least = held.promised if jump < 0 else min(held.promised, full_term)
+            # every lease here is shorter than the longest grace after a start
+            least = max(least, started + held.seconds)
             assert time >= least, f"the lease of {demand} ended {least - time} s early"
         self.books.gone(gone)
 

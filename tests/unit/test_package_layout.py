@@ -94,7 +94,7 @@ def test_a_launch_file_uses_all_its_arguments(name: str, program: str) -> None:
 
 def test_the_parameter_files_have_the_defaults() -> None:
     node = pytest.importorskip("demandops_ros.node_parameters").DEFAULTS
-    command = pytest.importorskip("demandops_ros.detector.detect_command")
+    command = pytest.importorskip("demandops_ros.detector.detector_node")
     detector = {name: default for name, (default, *_) in command.PARAMETERS.items()}
     of_node = (node, {"state_repo", "fetch_interval", "log_level"})
     of_detector = (detector, {"rules", "log_level"})

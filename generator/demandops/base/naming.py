@@ -110,6 +110,11 @@ def absolute_topic(topic: str) -> str:
     return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
 
 
+def one_form(text: str) -> str:
+    """Return the composed form (Unicode NFC), so that two ways to write ``é`` are one id."""
+    return text if text.isascii() else unicodedata.normalize("NFC", text)
+
+
 def control_character(text: str) -> str:  # the first one, like `U+202E`
     if text.isprintable():  # Python calls no such character printable
         return ""

@@ -19,7 +19,7 @@ LEDGER_API_VERSION = "demandops.ledger/v3"
 
 # The version of rendering. It is increased whenever the same ledger and configuration render to
 # other bytes than before.
-RENDER_VERSION = 2
+RENDER_VERSION = 3
 
 # The branch that Flux and Argo CD read and the generator writes
 MAIN_BRANCH = "main"

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import logging
 import shutil
+import signal
 import sys
+from contextlib import suppress
 from enum import IntEnum
 from importlib import import_module
 
@@ -138,6 +140,18 @@ def main(args: list[str] | None = None) -> None:
 
 
 def run(args: list[str] | None = None) -> int:
+    # SIGTERM acts like Ctrl-C, because both must close generators and remove temporary folders
+    before = signal.getsignal(signal.SIGTERM)
+    with suppress(ValueError):  # only the main thread may set a handler
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        return _run(args)
+    finally:
+        with suppress(ValueError):
+            signal.signal(signal.SIGTERM, before)
+
+
+def _run(args: list[str] | None) -> int:
     try:
         code = cli.main(args=args, prog_name="demandops", standalone_mode=False)
         return code if isinstance(code, int) else ExitCode.DONE

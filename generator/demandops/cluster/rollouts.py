@@ -31,6 +31,7 @@ from demandops.decide.planning.release_keys import affected_keys, all_keys, keys
 from demandops.decide.state import State
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.repo_settings import RepoSettings
+from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import World
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import domains_in_use, project_of
@@ -45,11 +46,9 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
     active = without_suspended(after)
     claims = [*active.ledger.claims_of_demand(request.demand)]
     for demanded in request.demanded if request.adds_claims else ():
-        claims += [
-            claim
-            for claim in active.ledger.claims_on(demanded.held.subject)
-            if {*demanded.requesters} & {*claim.requesters}
-        ]
+        own = demand_id(request.id, demanded.requesters)  # that of a join
+        if claim := active.ledger.get(ClaimKey(demanded.held.subject, own)):
+            claims.append(claim)
     changed = affected_keys(before, after, decision.changes.claims)
     targets = []
     for key in dict.fromkeys((*keys_of_claims(active, claims), *changed)):

@@ -252,8 +252,9 @@ class Connection:
         if self.broker:
             yield ("broker", self.broker)
         for route in self.topics:
-            _, taking = route.sender_and_receiver(self.source, self.target)
+            sender, taking = route.sender_and_receiver(self.source, self.target)
             yield ("brings", taking, route.written_topic)
+            yield ("from", sender)
 
 
 # ---- the interface of a connection type, and of the clients that it plans ----

@@ -176,8 +176,7 @@ def join(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Change
         others = [
             claim
             for claim in start.claims_of_demand(key.demand)
-            if not (claim.joined and claim.request == request.id)
-            or {*claim.requesters}.isdisjoint(item.requesters)
+            if not claim.joined or {*claim.requesters}.isdisjoint(item.requesters)
         ]
         if others:
             message = (

@@ -133,6 +133,8 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
         if text is not None and text == current:
             continue
+        if old and new and text is not None:
+            old = texts.with_new_values_of_unused(old, new, text)
         if old or new:
             releases.append(describe_change(old, new, current is not None))
     _refuse_large(files, most, read)
@@ -202,6 +204,7 @@ class _Texts:
     def __init__(self, config: Config, evaluate: Evaluate) -> None:
         self._config, self._evaluate = config, evaluate
         self._late: dict[str, OverLimit] = {}
+        self._used: dict[tuple[str, str], bool] = {}  # by template and parameter
 
     def text_of(self, release: Release, current: str | None) -> str:
         template = ""
@@ -214,6 +217,25 @@ class _Texts:
         except OverLimit as error:
             self._late[template] = error
             raise
+
+    def with_new_values_of_unused(self, old: Release, new: Release, text: str) -> Release:
+        # A service has all parameters of its definition, but its template may use only some. One
+        # that leaves the file as it is with its old value is no part of the change.
+        if not isinstance(old, ServiceRelease) or not isinstance(new, ServiceRelease):
+            return old
+        template, unused = self._config.values_template(new.service), dict[str, object]()
+        for name, value in new.parameters.items():
+            if new.shaping.held or old.parameters.get(name, value) == value:
+                continue
+            if (template, name) not in self._used:
+                self._used[template, name] = True
+                with suppress(InvalidInput):
+                    former = {**new.parameters, name: old.parameters[name]}
+                    tried = self.text_of(replace(new, parameters=former), None)
+                    self._used[template, name] = tried != text
+            if not self._used[template, name]:
+                unused[name] = value
+        return replace(old, parameters={**old.parameters, **unused})
 
 
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:

@@ -77,15 +77,16 @@ class Decision:
     approval: tuple[str, ...] = ()
     # the paths of the overrides that change the content of the rendered files
     overrides: tuple[str, ...] = ()
-    # whether services now request less of a node, so that waiting demands are tried again
-    frees: bool = False
+    # whether waiting demands are tried again: services now request less of a node, or one of the
+    # demands shares an application that was booked
+    awaited: bool = False
 
     @property
     def placed(self) -> tuple[str, ...]:
         """A sentence for each placed application or service: the chosen node and the reason."""
         if isinstance(self.request, Drain):
             return self.request.moved
-        return tuple(text for item in self.request.demanded for text in item.placed)
+        return _once(*(text for item in self.request.demanded for text in item.placed))
 
     @property
     def lease_s(self) -> int | None:
@@ -291,6 +292,10 @@ def _too_large(spent: OverBudget) -> Fault:
     return fault("", str(spent), code="too-large")
 
 
+def _once(*texts: str) -> tuple[str, ...]:
+    return tuple(filter(None, dict.fromkeys(texts)))
+
+
 # The codes of faults that might not occur if other nodes were chosen for the demand
 _BY_NODE = frozenset(
     ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
@@ -387,18 +392,26 @@ def _carried_out(
         changes=changes,
         files=rendered.files if changes.claims or changes.waiting else {},
         releases=rendered.releases,
-        warnings=(
-            *notes_on(request, after, changes, rendered),
-            *filter(None, (difference.warning() for difference in differing)),
+        # a demand may list one thing twice, and several releases may have one reason
+        warnings=_once(
+            *notes_on(request, state, after, changes, rendered),
+            *(difference.warning() for difference in differing),
         ),
-        approval=(
+        approval=_once(
             *permission.approval_reasons(
                 request, ((c.before, c.after) for c in changes.claims), config
             ),
-            *filter(None, (difference.approval_reason() for difference in differing)),
+            *(difference.approval_reason() for difference in differing),
         ),
         overrides=rendered.overrides,
-        frees=any(amount < 0 for amount in grown.values()),
+        awaited=any(amount < 0 for amount in grown.values())
+        # a demand that waits for room for an application runs wherever another demand books it
+        or any(
+            subject in changes.subjects()
+            for waiting in state.ledger.waiting.values()
+            if waiting.demand != request.demand
+            for subject in waiting.put.subjects()
+        ),
     )
 
 
@@ -450,7 +463,9 @@ def _booked(
 # ---- notes for the requester, in addition to the outcome ----
 
 
-def notes_on(request: Demand, after: World, changes: Changes, rendered: Changeset) -> Iterator[str]:
+def notes_on(
+    request: Demand, before: World, after: World, changes: Changes, rendered: Changeset
+) -> Iterator[str]:
     yield from notes_on_instances(request)
     # a connection that an override denies carries nothing
     ledger = without_suspended(after).ledger
@@ -473,7 +488,8 @@ def notes_on(request: Demand, after: World, changes: Changes, rendered: Changese
                     f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
                     "the inventory), so no client of this connection carries it"
                 )
-    yield from warnings.notes(request, after)
+    yield from warnings.notes(request, before)
+    yield from warnings.unheld_output_notes(request, after)
     yield from warnings.lost_output_notes(changes, after)
     yield from rendered.blocked
     if isinstance(request, Drain):

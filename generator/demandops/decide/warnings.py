@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Iterator
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from itertools import groupby, islice, takewhile
 
@@ -103,6 +103,12 @@ def unheld_output_warnings(world: World) -> Iterator[Fault]:
             yield fault("", note).within(claim_files.path_of(claim.key))
 
 
+def unheld_output_notes(request: Demand, after: World) -> Iterator[str]:
+    for item in request.demanded if request.adds_claims else ():
+        demand = request.demand or demand_id(request.id, item.requesters)
+        yield from _unheld_outputs(item.held, demand, after)
+
+
 def _unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
     if not isinstance(held, Application) or held.held_for:
         return
@@ -160,57 +166,73 @@ _WORD = re.compile(r"[A-Za-z]+")
 _SHORT = 4
 
 
-def notes(request: Demand, world: World) -> Iterator[str]:
-    if request.adds_claims:
-        known = _KnownTopics(world)
-        for item in request.demanded:
-            demand = request.demand or demand_id(request.id, item.requesters)
-            yield from known.notes_on(item.held)
-            yield from _unheld_outputs(item.held, demand, world)
+def notes(request: Demand, before: World) -> Iterator[str]:
+    # ``before`` is the world before the demand, or its own topics would all be known
+    if not request.adds_claims:
+        return
+    known, own = _KnownTopics(before.config), request.demand
+    booked: dict[str, frozenset[str]] = {}
+
+    def earlier(node: str, topic: str) -> Collection[str]:
+        # thousands of claims may read from a node, but nearly always one of them names the topic
+        if any(claim.demand != own for claim in before.ledger.each_reading(node, topic)):
+            return (topic,)
+        if node not in booked:
+            claims = (claim for claim in before.ledger.claims_from(node) if claim.demand != own)
+            named = (named for claim in claims for named in _named_topics(claim.held))
+            booked[node] = frozenset(topic for sender, topic in named if sender == node)
+        return booked[node]
+
+    for item in request.demanded:
+        yield from known.notes_on(item.held, earlier)
 
 
 def misspelled_topic_warnings(world: World) -> Iterator[Fault]:
-    known = _KnownTopics(world)
-    for claim in sorted(world.ledger, key=lambda claim: claim_files.path_of(claim.key)):
-        for note in known.notes_on(claim.held):
-            yield fault("", note).within(claim_files.path_of(claim.key))
+    known, earlier = _KnownTopics(world.config), defaultdict[str, set[str]](set)
+    claims = ((claim.booked, claim_files.path_of(claim.key), claim) for claim in world.ledger)
+    for _, path, claim in sorted(claims, key=lambda entry: entry[:2]):
+        for note in known.notes_on(claim.held, lambda node, _: earlier[node]):
+            yield fault("", note).within(path)
+        for node, topic in _named_topics(claim.held):
+            earlier[node].add(topic)
+
+
+def _named_topics(held: Application | Connection) -> list[tuple[str, str]]:
+    if isinstance(held, Application):
+        return [(topic.source, topic.topic) for _, topic in held.all_inputs()]
+    ends = held.source, held.target
+    return [(route.sender_and_receiver(*ends)[0], route.read_topic) for route in held.topics]
 
 
 class _KnownTopics:
-    def __init__(self, world: World) -> None:
-        self._world = world
+    def __init__(self, config: Config) -> None:
+        self._config = config
         self._listed: dict[str, frozenset[str]] = {}
-        self._booked: dict[tuple[str, str], frozenset[str]] = {}
         self._told: set[tuple[str, str]] = set()
 
-    def notes_on(self, held: Application | Connection) -> Iterator[str]:
-        if isinstance(held, Application):
-            what = f"application '{held.id}'"
-            for role, input in held.all_inputs():
-                place = (role, input.source)
-                if place not in self._booked:
-                    booked = self._world.ledger.usual_topics(*place, excluded="")
-                    self._booked[place] = frozenset(booked)
-                known = (self._of(input.source), self._booked[place])
-                yield from self._notes(what, input.source, input.topic, *known)
-            return
-        for route in held.topics:
-            sender, _ = route.sender_and_receiver(held.source, held.target)
-            topic = route.read_topic
-            yield from self._notes(f"connection '{held.id}'", sender, topic, self._of(sender))
+    def notes_on(
+        self,
+        held: Application | Connection,
+        earlier: Callable[[str, str], Collection[str]],
+    ) -> Iterator[str]:
+        """Yield a note for each topic that is probably misspelled.
 
-    def _notes(self, what: str, node: str, topic: str, *known: frozenset[str]) -> Iterator[str]:
-        # not united: a demand may list thousands of topics, and all of them may be known
-        if (node, topic) in self._told or any(topic in topics for topics in known):
-            return
-        near = [each for topics in known for each in topics if _is_misspelling(topic, each)]
-        if near:
-            self._told.add((node, topic))
-            yield f"{what}: '{node}' is not known to publish {topic}; did you mean '{min(near)}'?"
+        ``earlier`` maps a node and a topic to the topics that earlier demands name for the node.
+        """
+        what = "application" if isinstance(held, Application) else "connection"
+        for node, topic in _named_topics(held):
+            listed, booked = self._of(node), earlier(node, topic)
+            if (node, topic) in self._told or topic in listed or topic in booked:
+                continue
+            near = [each for each in (*listed, *booked) if _is_misspelling(topic, each)]
+            if near:
+                self._told.add((node, topic))
+                meant = f"did you mean '{min(near)}'?"
+                yield f"{what} '{held.id}': '{node}' is not known to publish {topic}; {meant}"
 
     def _of(self, node: str) -> frozenset[str]:
         if node not in self._listed:
-            entry = self._world.config.nodes.get(node)
+            entry = self._config.nodes.get(node)
             topics = set[str]()
             if entry:
                 topics = {*entry.topics.values(), *entry.types}.union(*entry.bridged.values())

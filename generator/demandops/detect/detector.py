@@ -189,10 +189,14 @@ class _Entry:
         if self.is_under_way or now < self.not_before:
             return None
         if held is not None:
-            # A ``Demand`` replaces the one with its id. Any other held demand is ended first.
+            # A ``Demand`` replaces the one with its id and requesters; only they may put it anew.
+            # Any other held demand is ended first.
             is_replaced = wanted is not None and (
                 wanted == held
-                or (wanted.action == held.action == "demand" and wanted.id == held.id)
+                or (
+                    wanted.action == held.action == "demand"
+                    and (wanted.id, wanted.requesters) == (held.id, held.requesters)
+                )
             )
             if not is_replaced:
                 return "end", held.ended()

@@ -277,7 +277,7 @@ def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterat
                     yield fault(path, f"{message}leave that name out")
     else:
         yield from _missing(data, field, "id")
-        why = "a shutdown ends what its requesters hold, so each event needs its own requesters"
+        why = "a shutdown ends what its requesters joined, so each event needs its own requesters"
         kind = "object_detection_fusion_app"
         listed = [
             (f"apps[{index}].{kind}.requester_ids", app.get(kind, {}).get("requester_ids", []))

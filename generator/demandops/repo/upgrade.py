@@ -148,6 +148,8 @@ def _plan(
             raise InvalidInput(held)
     files_of_ledger = _in_this_schema(trees.texts(tree, (LEDGER_ROOT,)), state.ledger)
     changed = dict(batch.render_all(state, {**files_of_ledger, **applied.files}).files)
+    if last_valid_config.PATH in tree:  # the state is valid, or the upgrade is refused
+        changed[last_valid_config.PATH] = None
     changed |= {path: text for path, text in by_people.items() if text != files[path]}
     upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))
     return upgrade, batch, state, applied.keys

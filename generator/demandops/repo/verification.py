@@ -15,8 +15,8 @@ from demandops.base.settings import (
     NOTES_ROOT,
     RENDER_VERSION,
 )
-from demandops.decide.planning.planner import TracedPlan
-from demandops.decide.planning.release_keys import ReleaseKey
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.config import CONFIG_ROOTS
@@ -38,7 +38,7 @@ from demandops.repo.load import ledger_files, state_in_effect
 # A commit of the generator may change generated files, reports, and the claims that its message
 # names. Some operations may change further files.
 
-# No decision depends on what is below these.
+# An upgrade removes what earlier versions wrote below these.
 _GONE = tuple(f"{root}/" for root in records.GONE_ROOTS)
 # Operations that may rewrite a claim, to start its lease or to change its schema.
 _REWRITING = ("follow", "upgrade")
@@ -58,10 +58,12 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     named = {f"{claim_files.segment(demand)}.yaml" for demand in demands}
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
-        if root in (*GENERATED_ROOTS, NOTES_ROOT):
-            continue
         # of a folder, the files count
-        if path.startswith(_GONE) or isinstance(trees.entry(commit.tree, path), Tree):
+        if root in (*GENERATED_ROOTS, NOTES_ROOT) or isinstance(
+            trees.entry(commit.tree, path), Tree
+        ):
+            continue
+        if operation == "upgrade" and not blob and path.startswith(_GONE):
             continue
         if operation == "upgrade" and (path == ROOT_FILE or _only_removes_ignored(commit, path)):
             continue
@@ -86,7 +88,11 @@ def _only_removes_ignored(commit: Commit, path: str) -> bool:
 
 
 def _only_rewrites(commit: Commit, path: str) -> bool:
-    # at most the schema of a claim and the start of its lease
+    # at most the schema of a record and the start of a claim's lease
+    if path.startswith(f"{records.WAITING_ROOT}/"):
+        texts = (trees.read_text(tree, path) for tree in (commit.parents[0].tree, commit.tree))
+        waits, still = (records.read_waiting(text or "", path) for text in texts)
+        return waits is not None and waits == still and _is_canonical(commit, path)
     before, after = (
         ledger_files.valid_claim_at(tree, path) for tree in (commit.parents[0].tree, commit.tree)
     )
@@ -114,9 +120,9 @@ def _is_canonical(commit: Commit, path: str) -> bool:
 # invalid files, and for each commit whose configuration differs from that of the commit before.
 #
 # By differences, the program starts from the commit that it verified before. It assumes that equal
-# object ids mean equal files, and that plans and rendered files depend only on their input. It does
-# not rely on the generator's choice of the affected releases, but renders a release again if any
-# input of its plan changed (:class:`.TracedPlan`). Then it compares the ids of all generated files.
+# object ids mean equal files, and that plans and rendered files depend only on their input. It
+# renders the releases again that the changed claims affect, and compares the ids of all generated
+# files. A release that this choice missed would differ in the last commit, which is verified whole.
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,14 +144,13 @@ class _Proof:
     # the files that a commit should have, rendered again to compare with its committed files
     def __init__(self, state: State, commit: Commit) -> None:
         self.state, self._commit = state, commit
-        self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         # with an override that sets ``hold``: such a file's text depends on the parent commit
         self._held: dict[ReleaseKey, Release] = {}
         base_files = manifests.base_files(state.config)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
         self._committed = _generated_files(commit.tree)
-        self._render(())
+        self._render(all_keys(state))
 
     def can_advance_to(self, commit: Commit) -> bool:
         # The configuration and ended overrides may affect all releases. With a problem report, some
@@ -169,11 +174,13 @@ class _Proof:
             self._committed.pop(path, None)
             if blob is not None:
                 self._committed[path] = blob
-        self.state, self._commit = replace(self.state, ledger=ledger), commit
-        self._render(changes)
+        before_state, self._commit = self.state, commit
+        self.state = replace(before_state, ledger=ledger)
+        self._render(affected_keys(before_state, self.state, changes))
 
-    def _render(self, changes: Iterable[ClaimChange]) -> None:
-        for key, release in self._plan.advance(self.state.ledger, changes).items():
+    def _render(self, keys: Iterable[ReleaseKey]) -> None:
+        for key in keys:
+            release = plan(self.state, key)
             self._planned.pop(key, None)
             self._held.pop(key, None)
             if release is not None and release.shaping.held:

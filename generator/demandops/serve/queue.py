@@ -160,7 +160,6 @@ def ticket_from_journal(entry: JournalEntry) -> Ticket:
 # demand whose turn it is, the queue returns the other demand first.
 #
 # - Demands that share an application, a connection or a demand id keep their order.
-# - Goals of the reference's action that share a requester keep their order.
 # - A rollback or a decommission may touch any subject, so it overtakes no demand, and no demand
 #   overtakes it.
 

@@ -221,7 +221,7 @@ def test_a_forged_record_of_the_files_in_effect_stops_no_start(
     tip = rig.tip(bare)
     message = (
         f"x\n\nWhy: x\n\nOperation: follow\nIn-Force: {tip}\nConfiguration: {tip}\n"
-        f"Stands-In: demandops.yaml {stands_in}\nRender-Version: 2\n"
+        f"Stands-In: demandops.yaml {stands_in}\nRender-Version: 3\n"
     )
     person.change({}, message, FORGER)
     with rig.running(bare) as generator:
@@ -237,7 +237,7 @@ def test_a_forged_commit_with_an_invalid_claim_stops_no_demand(
         person.override(broken="odd")
         rig.book(generator, goal(2))
         (path,) = rig.claims(bare, "fusion-1")
-        person.change({path: "kind: 5\n"}, "x\n\nWhy: x\n\nRender-Version: 2", FORGER)
+        person.change({path: "kind: 5\n"}, "x\n\nWhy: x\n\nRender-Version: 3", FORGER)
         person.change({path: "kind: 6\n"})
         rig.book(generator, goal(3), leave(1))
     with rig.running(address) as generator:

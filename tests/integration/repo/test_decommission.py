@@ -6,11 +6,17 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops.model.demand.demand import Decommission
+from demandops.connections.connection import Connection, Route
+from demandops.connections.mqtt import MQTT
+from demandops.model.demand import goals
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import Claim
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.cli import Ran, Run
+from tests.kit.memory import NOW
+from tests.kit.repo import GitRepo
 from tests.kit.rig import Person, goal
 
 
@@ -72,6 +78,19 @@ def test_with_a_requester_goes_all_that_is_claimed_in_its_name(
     rig.assert_sound(bare)
 
 
+def test_a_claim_from_before_ids_had_one_form_can_be_released(
+    generator: Generator, bare: Path, decommission: Run
+) -> None:
+    link = Connection("c", MQTT, "vehicle00", "edge", "edge", (Route("/a", "/a"),))
+    old = Claim(link, "cafe\u0301", "d", ("user1",), NOW)
+    GitRepo(bare).commit({claim_files.path_of(old.key): claim_files.text_of(old)})
+    generator.fetch_now()
+    rig.wait_until(lambda: generator.snapshot.state.ledger.get(old.key), "the claim is read")
+    assert decommission("user1").code == 0
+    assert rig.claims(bare) == []
+    rig.assert_sound(bare)
+
+
 def test_what_releases_nothing_changes_nothing(
     generator: Generator, bare: Path, decommission: Run
 ) -> None:
@@ -94,9 +113,9 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     """A decommission waits in the journal like any demand, so the next start carries it out."""
     generator = Generator(url)
     rig.book(generator, goal(1))
-    leaving = Decommission(id="vehicle01", kinds=frozenset({"node"}))
+    leaving = goals.decommission("vehicle01", frozenset({"node"}), "", "")
     with rig.away(bare):
-        generator.submit(leaving.goal(), "op-leave")
+        generator.submit(leaving, "op-leave")
         assert generator.close(timeout=0.3) is False
     assert rig.restart(url) is True
     assert rig.operations(bare)[-1] == "op-leave"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from demandops.base.errors import OverLimit
+from demandops.model.demand import goals as demand_goals
 from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
@@ -90,6 +91,6 @@ def test_a_rollback_may_take_longer_than_a_demand(
         then = rig.tip(bare)
         rig.book(generator, *(demand | {"shutdown": True} for demand in demands))
         who = ("A person", "person@example.org")
-        back = evaluation.goal(then, drop_newer=False, reason="a test", who=who)
+        back = demand_goals.rollback(then, drop_newer=False, reason="a test", who=who)
         assert receipt(generator.submit(back)).outcome == "restored"
     assert len(rig.claims(bare)) == 60

@@ -10,8 +10,8 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from demandops.model.demand import goals as demand_goals
 from demandops.repo.write.journal import DamagedJournal
-from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -29,9 +29,9 @@ def _client(lane: int) -> list[tuple[str, rig.Goal]]:
     made = []
     for turn in range(60):
         number = lane + turn * LANES
-        made.append((f"join-{number}", goal(number, alone=True)))
+        made.append((f"join-{number}", goal(number)))
         if turn % 3:
-            made.append((f"leave-{number}", goal(number, alone=True, shutdown=True)))
+            made.append((f"leave-{number}", goal(number, shutdown=True)))
     return made
 
 
@@ -162,7 +162,8 @@ def test_a_rollback_that_a_crash_left_in_the_journal_is_carried_out_at_the_next_
         rig.book(generator, goal(1))
         to, then = rig.tip(bare), rig.books(bare)
         rig.book(generator, goal(2))
-    back = evaluation.goal(to, drop_newer=True, reason="a test", who=("A", "a@example.org"))
+    who = ("A", "a@example.org")
+    back = demand_goals.rollback(to, drop_newer=True, reason="a test", who=who).goal
     drivers.start(bare, [[demand("back", back)]], die_at="journaled").listen()
     assert rig.books(bare) != then
     assert rig.restart(bare)

@@ -50,8 +50,9 @@ def put(demand: str, lease: Any = 60, who: str = "vehicle00", **more: Any) -> ri
     return goals.put(demand, who, "station00", **({} if lease is None else {"lease": lease}) | more)
 
 
-def renew(demand: str, who: str = "vehicle00") -> rig.Goal:
-    return {"kind": "Demand", "operation": "renew", "demand": demand, "requesters": [who]}
+def renew(demand: str, *who: str) -> rig.Goal:
+    who = who or ("vehicle00", "station00")
+    return {"kind": "Demand", "operation": "renew", "demand": demand, "requesters": [*who]}
 
 
 def held(generator: Generator, demand: str) -> tuple[Claim, ...]:
@@ -109,6 +110,32 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
         rig.wait_until(lambda: "op-renew" in rig.operations(bare), "the renewal is taken up")
         assert held(generator, "d")
     assert expiries(bare) == []
+
+
+def test_who_could_not_renew_while_no_generator_ran_can_after_the_start(
+    clock: Clock, bare: Path
+) -> None:
+    with rig.running(bare, runtime=clock) as generator:
+        rig.book(generator, put("alive", 600), put("gone"))
+    clock.pass_(3600)
+    with rig.running(bare, runtime=clock) as generator:
+        rig.book(generator, renew("alive"))
+        clock.pass_(60)
+        wait_until_gone(generator, "gone")
+        assert held(generator, "alive")
+    assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["gone"]]
+
+
+def test_a_generator_that_starts_holds_up_no_end_at_another(
+    clock: Clock, url: str, bare: Path
+) -> None:
+    with rig.running(url, runtime=clock) as generator:
+        rig.book(generator, put("d"))
+        clock.pass_(50)
+        with rig.running(url, runtime=clock):
+            clock.pass_(11)
+            wait_until_gone(generator, "d")
+    assert len(expiries(bare)) == 1
 
 
 def test_an_end_that_waits_while_the_clock_is_set_back_does_not_come(
@@ -181,6 +208,8 @@ def test_odd_goals_are_refusals_and_no_faults_of_the_generator(
     release = {"kind": "Demand", "operation": "release"}
     with rig.running(bare) as generator:
         assert {claim.demand for claim in generator.snapshot.state.ledger} == {*names}
-        rig.book(generator, *(release | {"demand": n, "requesters": [n]} for n in names))
+        rig.book(
+            generator, *(release | {"demand": n, "requesters": [n, "station00"]} for n in names)
+        )
     assert rig.claims(bare) == []
     rig.assert_sound(bare, verify_last=3)

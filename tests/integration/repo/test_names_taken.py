@@ -82,7 +82,8 @@ def test_a_claim_by_hand_whose_release_has_the_name_of_another_is_held_back(
     with rig.running(bare) as generator:
         rig.book(generator, joining(PAIR[0]))
         (path,) = rig.claims(bare)
-        data = yaml.safe_load(read(bare, path)) | {"application": PAIR[1], "node": "cloud"}
+        data = yaml.safe_load(read(bare, path))
+        data["application"] |= {"id": PAIR[1], "node": "cloud"}
         key = ClaimKey(Subject(SubjectKind.APPLICATION, PAIR[1]), data["demand"])
         held_back = {claim_files.path_of(key): yaml.safe_dump(data)}
         person.change(held_back)
@@ -104,7 +105,9 @@ def test_a_claim_by_hand_in_the_file_of_another_is_held_back(bare: Path, person:
     with rig.running(bare) as generator:
         rig.book(generator, joining(first))
         (path,) = rig.claims(bare)
-        text = yaml.safe_dump(yaml.safe_load(read(bare, path)) | {"application": other})
+        data = yaml.safe_load(read(bare, path))
+        data["application"]["id"] = other
+        text = yaml.safe_dump(data)
         person.fetch()
         (person.folder / path).write_text(text)
         faults = merge_check.check(person.folder).faults

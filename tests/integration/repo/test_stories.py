@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import yaml
 from demandops.decide.state import rendered_files
+from demandops.model.demand import goals as demand_goals
 from demandops.repo.merge_check import merge_check
-from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
 from tests.kit import config, goals, plain_yaml, rig
@@ -130,7 +130,7 @@ class Story:
     def roll_back(self, what: Mapping[str, Any]) -> None:
         """Send a rollback ``to`` a commit that was noted."""
         who, to = ("A", "a@example.org"), self._noted[what["to"]]
-        goal = evaluation.goal(to, drop_newer=what["drop_newer"], reason="x", who=who)
+        goal = demand_goals.rollback(to, drop_newer=what["drop_newer"], reason="x", who=who)
         assert rig.outcome(self._generator.submit(goal)) == what["gives"]
 
     def propose(self, demands: Mapping[str, Any]) -> None:

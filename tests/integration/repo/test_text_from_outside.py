@@ -26,7 +26,7 @@ from tests.kit.rig import Person, goal
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 POLICY = "policy/access-domains.yaml"
 DETECTION = "clusters/c-its/perception/edge/od-edge-station00.yaml"
-FORGED = "Why: x\n\nOperation: join\nRequester: control-room\nIn-Force: none\nRender-Version: 2"
+FORGED = "Why: x\n\nOperation: join\nRequester: control-room\nIn-Force: none\nRender-Version: 3"
 
 
 def labelled(text: str) -> Any:
@@ -105,7 +105,8 @@ def by_hand(
     """Return a copy of user1's claim file, for another requester."""
     path = next(path for path in rig.claims(bare, "user1") if "applications" in path)
     data = yaml.safe_load(read(bare, path))
-    data |= {"application": app, "demand": demand, "requesters": [requester]}
+    data |= {"demand": demand, "requesters": [requester]}
+    data["application"]["id"] = app
     key = ClaimKey(Subject(SubjectKind.APPLICATION, app), demand)
     return {claim_files.path_of(key): yaml.safe_dump(data)}
 

@@ -37,7 +37,7 @@ def forged(
     """Return the verdict on a forged commit between two demands."""
     rig.book(generator, rig.goal(2))
     assert text != file(bare, path)
-    message = f"Forged\n\n{trailers}\nDemand-Id: none\nRender-Version: 2"
+    message = f"Forged\n\n{trailers}\nDemand-Id: none\nRender-Version: 3"
     made = person.change({path: text}, message, FORGER)
     rig.book(generator, rig.goal(3))
     return verdicts(bare)[made]

@@ -261,9 +261,9 @@ def test_views_derived_step_by_step_equal_views_derived_from_scratch(
     person.change({appdef: text}, "Scale")
     wait_until(lambda: follower.newest.commit_state.config.files[appdef] == text, "it is shown")
     joins = [yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT]
-    one_leaves = copy.deepcopy(joins[0]) | {"shutdown": True, "connections": []}
-    one_leaves["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station00"]
-    for goal in (joins[2], one_leaves, *joins[3:]):
+    another = copy.deepcopy(joins[0]) | {"connections": []}
+    another["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station01"]
+    for goal in (joins[2], another, another | {"shutdown": True}, *joins[3:]):
         book(booked, goal)
         _assert_taken_over(follower, look)
 

@@ -120,7 +120,7 @@ def test_no_node_gets_more_than_it_has_and_what_waits_does_not_fit_and_is_booked
             assert "operation" not in made or codes == {"not-held"}
         elif taken.outcome == "waiting":
             sent[made["demand"]] = made
-        if isinstance(taken, Decision) and taken.frees:
+        if isinstance(taken, Decision) and taken.awaited:
             book_waiting(repo)
         now = used(repo)
         assert {id: repo.state.usage().of(id, "cpu") / 1000 for id in now} == dict(now)
@@ -132,7 +132,7 @@ def test_no_node_gets_more_than_it_has_and_what_waits_does_not_fit_and_is_booked
             assert one.put.goal == sent[one.demand]
             assert not repo.state.ledger.claims_of_demand(one.demand)
             assert repo.decide(one.put).outcome == "waiting"
-        turns = [(-one.priority, one.since) for one in waiting]
+        turns = [(-one.put.priority, one.since) for one in waiting]
         assert turns == sorted(turns)
         assert ledger_in(repo.files) == repo.state.ledger
     claims = list(repo.state.ledger)

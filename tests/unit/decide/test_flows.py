@@ -16,8 +16,8 @@ import pytest
 import yaml
 from demandops.base.errors import Refused
 from demandops.decide.placement.relocation import changed_claim_files, following_overrides
-from demandops.decide.planning.planner import TracedPlan, plan
-from demandops.decide.planning.release_keys import ReleaseKey, all_keys
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
 from demandops.decide.state import rendered_files
 from demandops.decide.warnings import policy_warnings
 from demandops.model.config.config import Config
@@ -354,15 +354,16 @@ def test_every_topic_that_a_service_reads_comes_in_one_way_and_no_other_is_carri
     graphs = Graphs(random)
     demands = Demands(random, graphs)
     repo = MemoryRepo(graphs.files)
-    plain, traced, releases = repo.config, TracedPlan(repo.config), dict[ReleaseKey, Any]()
+    plain, releases = repo.config, dict[ReleaseKey, Any]()
     for _ in range(length):
-        before = copy.deepcopy(demands.held), dict(demands.where)
+        before, state = (copy.deepcopy(demands.held), dict(demands.where)), repo.state
         taken = repo.take(demands.next())
         if isinstance(taken, Refused):
             assert moving and {fault.code for fault in taken.faults} == {"conflict"}
             demands.held, demands.where = before
         elif not moving:
-            releases |= traced.advance(repo.state.ledger, taken.changes.claims)
+            changed = affected_keys(state, repo.state, taken.changes.claims)
+            releases |= {key: plan(repo.state, key) for key in changed}
             planned = {key: plan(repo.state, key) for key in all_keys(repo.state)}
             assert {key: one for key, one in releases.items() if one} == planned
         active = {one.name: one for one in overrides(random, graphs)} if moving else {}

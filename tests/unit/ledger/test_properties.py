@@ -6,27 +6,27 @@ no code of the program.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
 from datetime import timedelta
 from random import Random
+from typing import Any
 
 import pytest
 from demandops.decide.decision import Decision
 from demandops.decide.state import rendered_files
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey, demand_id
-from demandops.model.ledger.records import SHUTDOWNS_ROOT
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import IN_FULL, TIMES, chances, examples, told
-from tests.kit.goals import application, connection, goal, link
+from tests.kit.goals import application, goal
 from tests.kit.memory import MemoryRepo, ledger_in, outcome
-from tests.model.books import Books, Demand, Goal, Result
+from tests.model.books import Books, Demand, Result
 from tests.model.goals import SKELETON, Maker, ego, shutdown_of
-
-PAUSES = (1, 1, 1, 60, 400, 899, 900, 901)
-"""Seconds between two requests; the ledger remembers a shutdown for 900 seconds."""
+from tests.model.listed import Goal, Topic, items
+from tests.model.view import view
 
 Key = tuple[tuple[str, str], str]
 """A claim's key: its subject and its demand id."""
@@ -34,7 +34,7 @@ Key = tuple[tuple[str, str], str]
 
 def key_of(subject: tuple[str, str], demand: Demand) -> Key:
     """Return the key that the program's claim must have for a claim of the model."""
-    return subject, demand_id(*demand)
+    return subject, demand_id(*demand) if demand[1] else demand[0]
 
 
 def key_from(key: ClaimKey) -> Key:
@@ -46,23 +46,22 @@ class Walk:
     """A repo and the model, which take the same requests and are compared after each."""
 
     def __init__(self, random: Random) -> None:
-        self.maker = Maker(random)
-        self._random = random
+        self.maker = Maker(random, both=True)
         self._repo, self._books = MemoryRepo(), Books(SKELETON)
 
     def take(self, request: Goal) -> None:
-        pause = self._random.choice(PAUSES)
-        self._repo.now += timedelta(seconds=pause)
-        expected = self._books.take(request, pause)
+        self._repo.now += timedelta(seconds=1)
+        expected = self._books.take(request)
         taken = self._repo.take(request)
-        assert outcome(taken) == expected.outcome, (pause, expected, taken)
-        holds = {key_of(*key): holds for key, holds in self._books.holds().items()}
-        assert self._holds() == holds, (pause, request)
-        assert self._repo.view() == self._books.view()
+        assert outcome(taken) == expected.outcome, (expected, taken)
+        claims = {
+            key_of(*key): ({*claim.topics}, claim.who) for key, claim in self._books.claims.items()
+        }
+        assert self._claims() == claims, request
+        assert self._repo.view() == view(self._books)
         if isinstance(taken, Decision):
             assert_changes(taken, expected)
-            if not request["shutdown"]:
-                self._assert_counts_once(request)
+            self._assert_counts_once(request)
 
     def assert_rendered_from_the_files(self) -> None:
         """Check that the ledger's files alone give the rendered files that the requests gave."""
@@ -71,18 +70,19 @@ class Walk:
         at_once = rendered_files(fresh)
         assert self._repo.below(*{path.split("/")[0] for path in at_once}) == at_once
 
-    def _holds(self) -> dict[Key, dict[tuple[str, ...], set[str]]]:
+    def _claims(self) -> dict[Key, tuple[set[tuple[str, ...]], tuple[str, ...]]]:
         return {
-            key_from(claim.key): {key: set(claim.holders(key)) for key in claim.held.topic_keys()}
+            key_from(claim.key): ({*claim.held.topic_keys()}, claim.requesters)
             for claim in self._repo.state.ledger
         }
 
     def _assert_counts_once(self, request: Goal) -> None:
-        same = self.maker.again(request)
-        again = self._repo.decide(same, self._repo.now + timedelta(days=1))
-        assert again.outcome == "unchanged", same
-        assert again.state == self._repo.state
-        assert (dict(again.files), again.changes.claims, again.releases) == ({}, (), ())
+        again = request if "kind" in request else self.maker.again(request)
+        repo = self._repo.copy()
+        repo.now += timedelta(days=365)
+        gives_up = request.get("shutdown") or request.get("operation") == "release"
+        assert outcome(repo.take(again)) == ("refused" if gives_up else "unchanged"), again
+        assert (repo.files, repo.state) == (self._repo.files, self._repo.state)
 
 
 def assert_changes(taken: Decision, expected: Result) -> None:
@@ -91,7 +91,7 @@ def assert_changes(taken: Decision, expected: Result) -> None:
     assert changed == {key_of(*key) for key in expected.touched}
     paths = {claim_files.path_of(change.key) for change in taken.changes.claims}
     assert {path for path in taken.files if claim_files.kind_of(path)} == paths
-    assert bool(taken.files) == expected.effective
+    assert bool(taken.files) == bool(expected.touched)
     named = taken.changes.not_held
     for vain in expected.not_held:
         assert any(_names(text, *vain) for text in named), (vain, named)
@@ -99,17 +99,14 @@ def assert_changes(taken: Decision, expected: Result) -> None:
         assert any(_names(text, *vain) for vain in expected.not_held), (text, expected.not_held)
 
 
-def _names(text: str, subject: str, topic: tuple[str, ...] | None, who: str) -> bool:
-    """Return whether a text names a subject and a requester, and no topic other than ``topic``."""
+def _names(text: str, subject: str, topic: Topic | None, who: tuple[str, ...]) -> bool:
+    """Return whether a text names a subject and its requesters, and ``topic`` if there is one."""
     words = " ".join(("topic", *topic) if len(topic) == 1 else topic[:2]) if topic else ""
-    named = ": " not in text or f": {words} " in text
-    return named and f"'{subject}'" in text and text.endswith(f" for {who}")
+    named = f": {words} " in text if topic else ": " not in text
+    return named and f"'{subject}'" in text and text.endswith(f" for {', '.join(who)}")
 
 
 def assert_same(one: MemoryRepo, other: MemoryRepo) -> None:
-    """Check that two repos are the same but for the shutdowns that they remember."""
-    one.forget_shutdowns()
-    other.forget_shutdowns()
     assert one.state == other.state
     assert one.files == other.files
 
@@ -133,19 +130,6 @@ def test_they_stay_the_models_over_a_long_time(seed: int) -> None:
     walk.assert_rendered_from_the_files()
 
 
-def test_a_repeat_that_waited_in_a_journal_is_a_repeat_when_others_were_booked_meanwhile() -> None:
-    repo = MemoryRepo()
-    repo.send(goal([], [connection()], id="a"))
-    repo.send(goal([], [connection()], id="b"))
-    ends = goal([], [connection()], id="a", shutdown=True)
-    repo.send(ends)
-    repo.send(link(0), repo.now + timedelta(minutes=50))
-    assert repo.decide(ends, repo.now + timedelta(minutes=10)).outcome == "unchanged"
-    repo.send(link(1), repo.now + timedelta(minutes=62))
-    assert not repo.state.ledger.shutdowns.by_digest
-    assert not any(path.startswith(SHUTDOWNS_ROOT) for path in repo.files)
-
-
 def test_a_topic_that_a_shutdown_lists_twice_is_not_said_to_be_not_held() -> None:
     repo = MemoryRepo()
     both, first = (
@@ -154,6 +138,59 @@ def test_a_topic_that_a_shutdown_lists_twice_is_not_said_to_be_not_held() -> Non
     )
     repo.send(goal([both]))
     assert repo.send(goal([first, both], shutdown=True)).changes.not_held == ()
+
+
+def parties(request: Goal) -> set[Demand]:
+    if "demand" in request:
+        return {(request["demand"], ())}
+    return {(request["id"], claim.who) for _, claim in items(request, SKELETON)}
+
+
+@pytest.mark.parametrize("seed", range(100 * TIMES if IN_FULL else 30))
+def test_a_request_counts_once_and_concerns_only_its_party(seed: int) -> None:
+    """Of the model, which the tests above compare with the program."""
+    random, books, ended = Random(seed), Books(SKELETON), list[tuple[Goal, set[Demand]]]()
+    for request in Maker(random, both=True).sequence(150):
+        result, mine = books.take(request), parties(request)
+        assert {demand for _, demand in result.touched} <= mine
+        assert not books.take(request).touched
+        if request.get("shutdown"):
+            ended.append((request, mine))
+        elif result.touched:
+            ended = [(shutdown, of) for shutdown, of in ended if not of & mine]
+        for shutdown, _ in random.sample(ended, min(3, len(ended))):
+            assert books.take(shutdown).outcome == "refused"
+
+
+@pytest.mark.parametrize("seed", range(100 * TIMES if IN_FULL else 30))
+def test_nothing_is_left_if_the_joins_of_each_party_come_before_its_shutdowns(seed: int) -> None:
+    """Whatever others send between them, and however often each arrives."""
+    random, books = Random(seed), Books(SKELETON)
+    maker = Maker(random, calm=True, both=True)
+    joins = defaultdict[Any, list[Goal]](list)
+    for request in (maker.own() if random.random() < 0.3 else maker.join() for _ in range(40)):
+        if "operation" not in request:
+            (who,) = {claim.who for _, claim in items(request, SKELETON)}
+            joins[request.get("demand"), request.get("id"), who].append(request)
+    left = list[list[Goal]]()
+    for joined in joins.values():
+        ends = [
+            {"kind": "Demand", "operation": "release"}
+            | {name: each[name] for name in ("demand", "requesters")}
+            if "demand" in each
+            else shutdown_of(each)
+            for each in joined
+        ]
+        left.append([*often(joined, random), *often(ends, random)])
+    while left := [queue for queue in left if queue]:
+        books.take(random.choice(left).pop(0))
+    assert books.claims == {}
+
+
+def often(requests: list[Goal], random: Random) -> list[Goal]:
+    """Return each request once to three times, in any order."""
+    repeated = [request for request in requests for _ in range(random.randint(1, 3))]
+    return random.sample(repeated, len(repeated))
 
 
 @examples(10)

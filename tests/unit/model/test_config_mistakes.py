@@ -100,3 +100,14 @@ def test_a_usual_topic_that_ros_forbids_is_refused(topic: str) -> None:
 @pytest.mark.parametrize("name", _LISTED["valid"])
 def test_an_odd_but_valid_configuration_loads(name: str) -> None:
     load(configuration(changed(_LISTED["valid"][name])))
+
+
+def test_faults_of_one_place_come_in_the_order_of_their_names() -> None:
+    names = [f"role{number}" for number in range(9)]
+    uses = f"uses: {{driver: {{{', '.join(f'{name}: ego_data' for name in names)}}}}}\nservices:"
+    driver = Path(__file__).parents[2] / "appdefs" / "driver" / "service.yaml"
+    files = edited(APPDEF, "services:", uses) | {"appdefs/driver/service.yaml": driver.read_text()}
+    with pytest.raises(InvalidInput) as refused:
+        load(configuration(files))
+    fields = [fault.field for fault in refused.value.faults if "has no input" in fault.message]
+    assert fields == [f"uses.driver.{name}" for name in names]

@@ -59,8 +59,10 @@ def test_nothing_overtakes_what_it_must_follow(came: str, left: str) -> None:
 
 
 def test_what_must_keep_its_order_keeps_it() -> None:
-    shared = (reference("a0", "x", "a"), reference("a1", "y", "a", "b"), reference("b0", "z", "b"))
-    assert order(*shared) == ["a0", "a1", "b0"], "goals of the reference share a requester"
+    shared = (reference("a0", "x", "a"), reference("a1", "y", "a", "b"), reference("b0", "y", "b"))
+    assert order(*shared) == ["a0", "a1", "b0"], "the last two goals share a connection"
+    apart = (*shared[:2], reference("b0", "z", "b"))
+    assert order(*apart) == ["a0", "b0", "a1"], "a common requester orders nothing"
     of_one_client = map(ticket, ("a0 x", "a1 y", "b0 z"))
     assert order(*of_one_client, in_order=True) == ["a0", "a1", "b0"]
 

@@ -256,7 +256,7 @@ def test_small_adjustments_of_the_clock_count_as_no_step(
     clock: Clock, expiry: LeaseExpiry, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    ledger = leased(("a", 60, 0))
+    ledger = leased(("a", 30, 30))
     for _ in range(31):
         clock.pass_(1)
         clock.set_by(1)

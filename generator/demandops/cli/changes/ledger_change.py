@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, wait
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -51,31 +50,23 @@ def booked(generator: Generator, demand: Demand) -> Receipt:
 
 @contextmanager
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
-    # within the block, SIGTERM acts like Ctrl-C, because both must close the generator
-    before = signal.getsignal(signal.SIGTERM)
-    with suppress(ValueError):  # only the main thread may set a handler
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with progress("reading the ledger") as report:
+        generator = Generator(
+            state_repo,
+            requester_limit=None,  # the command is its only client
+            start_offline=False,
+            signing_key=signing_key,
+            progress=report,
+        )
     try:
-        with progress("reading the ledger") as report:
-            generator = Generator(
-                state_repo,
-                requester_limit=None,  # the command is its only client
-                start_offline=False,
-                signing_key=signing_key,
-                progress=report,
-            )
-        try:
-            yield generator
-        finally:
-            if not generator.close(timeout=0):
-                errors.print(
-                    "accepted demands that are not published stay in the journal (`demandops "
-                    "journal` lists them); the next generator that starts on this machine for this "
-                    "state repo continues with them"
-                )
+        yield generator
     finally:
-        with suppress(ValueError):
-            signal.signal(signal.SIGTERM, before)
+        if not generator.close(timeout=0):
+            errors.print(
+                "accepted demands that are not published stay in the journal (`demandops "
+                "journal` lists them); the next generator that starts on this machine for this "
+                "state repo continues with them"
+            )
 
 
 def print_consequences(decision: Decision) -> None:

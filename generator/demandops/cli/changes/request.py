@@ -200,15 +200,17 @@ def _book(
     documents: list[Document], state_repo: str, wait: bool, signing_key: Path | None
 ) -> list[Json]:
     answers: list[_Answer] = []
+    has_started = False
     try:
         with started_generator(state_repo, signing_key) as generator, progress("booking") as report:
+            has_started = True
             for document in documents:
                 answers.append(_Answer().of(generator, document, wait))
             for done, answer in enumerate(answers, start=1):
                 ledger_change.await_answer(answer)
                 report(done, len(documents))
     except KeyboardInterrupt:
-        if not answers:
+        if not has_started:
             raise
     if len(answers) < len(documents):
         answers.append(_Answer())  # it may be in the journal already

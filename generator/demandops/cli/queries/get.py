@@ -482,7 +482,7 @@ def get(
         raise click.UsageError("--watch follows the newest commit, so leave out --at")
     listed = KINDS[kind]
     wanted = {name: value for name, value in filters.items() if value is not None}
-    for name in wanted.keys() - listed.filters.keys():
+    for name in sorted(wanted.keys() - listed.filters.keys()):
         can = ", ".join(f"--{option}" for option in FILTERS if option in listed.filters)
         raise click.UsageError(f"{kind} have no --{name}; they can be filtered by {can}")
     with reader.opened(state_repo) as repo:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import signal
 import sys
 from collections.abc import Mapping
 from contextlib import closing
@@ -151,8 +150,6 @@ def web(state_repo: str, listen: str, access_file: Path | None, interval: float)
     with progress("reading the ledger") as report:
         follower = Follower(reader, clusters, interval, progress=report)
     with closing(WebServer(listen, "--listen", follower)) as server:
-        # SIGTERM acts like Ctrl-C, so that the server and its follower are closed
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
         click.echo(server.url)
         try:
             REAL.event().wait()

@@ -116,7 +116,7 @@ def status(
         errors.print(f"warning: application '{application}': {reason}")
     for name, reason in status.unreadable.items():
         errors.print(f"warning: cluster '{name}' cannot be read: {reason}")
-    for name in clusters.keys() - status.clusters:
+    for name in sorted(clusters.keys() - status.clusters):
         errors.print(
             f"warning: --clusters: the inventory has no cluster '{name}'"
             f"{suggestion(name, status.clusters)}"

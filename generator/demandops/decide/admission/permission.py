@@ -130,8 +130,6 @@ def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
 
 def owner_faults(request: Demand, ledger: Ledger, config: Config) -> Iterator[Fault]:
     """Yield a fault if the request changes a demand of others, which no rule lets it manage."""
-    if request.operation not in ("put", "release", "renew"):
-        return
     waiting, claims = ledger.waiting.get(request.demand), ledger.claims_of_demand(request.demand)
     owners = waiting.requesters if waiting else requesters_of(claims)
     homes = None if waiting else [claim.held.home for claim in claims]
@@ -143,25 +141,22 @@ def stranger_faults(
 ) -> Iterator[Fault]:
     # ``homes`` are the nodes of the demand's claims; None if it waits for one
     owners, asking = {*owners}, {*request.requesters()}
-    if not owners or asking == owners:
+    # the generator itself ends leases, and names nobody
+    if request.operation not in ("put", "release", "renew", "wait") or asking == owners:
         return
-    strangers = asking - owners
+    if not owners:
+        return
 
-    def may_manage(domain: AccessDomain) -> bool:
-        return all(
-            any(
-                matches(who, rule.requesters) and all(matches(o, rule.manages) for o in owners)
-                for rule in domain.rules
-            )
-            for who in strangers
-        )
+    def managed_in(domain: AccessDomain) -> set[str]:
+        rules = [r for r in domain.rules if all(matches(owner, r.manages) for owner in owners)]
+        return {who for who in asking if any(matches(who, rule.requesters) for rule in rules)}
 
     if homes is None:
-        is_managed = any(map(may_manage, config.domains.values()))
+        managers = set[str]().union(*map(managed_in, config.domains.values()))
     else:
         domains = {home: config.domain_of[home] for home in homes if home in config.domain_of}
-        is_managed = bool(domains) and all(map(may_manage, domains.values()))
-    if not (strangers and is_managed):
+        managers = asking.intersection(*map(managed_in, domains.values())) if domains else set()
+    if not (managers and asking <= managers | owners):
         message = (
             f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; name exactly these "
             "requesters, choose another demand id, or ask for a rule that 'manages' them in policy/"

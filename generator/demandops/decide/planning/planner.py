@@ -7,14 +7,13 @@ configuration alone, so every generator and every replay of a commit plans the s
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, TypeAlias, TypeGuard, TypeVar, cast
+from typing import TypeGuard
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import Refused, suggestion
-from demandops.base.naming import Subject
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection, ConnectionType, Route
 from demandops.connections.connection_types import route_faults
@@ -27,7 +26,7 @@ from demandops.model.config.config import Config
 from demandops.model.config.override import Override
 from demandops.model.demand.demand import Application, InputTopic
 from demandops.model.ledger.claim import Claim, requesters_of
-from demandops.model.ledger.ledger import ClaimChange, Ledger, World, index_entries
+from demandops.model.ledger.ledger import World
 from demandops.model.release import Autoscaler, Release, ServiceKey, ServiceRelease
 
 
@@ -288,99 +287,3 @@ def _replicas_of(
         needed = -(-len(counted[measure]) // share)  # rounded up
         return max(scaling.min, min(scaling.max, needed))
     return scaling.min
-
-
-# ---- a plan that follows a sequence of ledgers, to verify commits ----
-#
-# The plan records which parts of the ledger were read for each release. Only if one of these parts
-# changes is the release planned again. The generator instead predicts which releases a claim
-# affects (:func:`.release_keys.affected_keys`), but a proof must not rely on that prediction.
-
-T = TypeVar("T")
-Unit = TypeVar("Unit", bound="_Unit")
-
-_Unit: TypeAlias = "Subject | ReleaseKey"
-_Read: TypeAlias = "Subject | tuple[str, ...]"
-
-# Records a read of the whole ledger.
-_ALL: _Read = ("all",)
-
-
-class TracedPlan:
-    """The plan of one configuration, for ledgers that have the same ended overrides."""
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._keys: dict[Subject, tuple[ReleaseKey, ...]] = {}
-        self._readers: dict[_Read, set[_Unit]] = {}
-        self._planned: set[ReleaseKey] = set()
-
-    def advance(
-        self, ledger: Ledger, changes: Iterable[ClaimChange]
-    ) -> dict[ReleaseKey, Release | None]:
-        """Plan the releases that the changes may affect; the first call plans all releases.
-
-        A release that does not run any longer is ``None``. If this raises ``Refused``, the plan is
-        out of date and must not be used again.
-        """
-        # The reads whose result may differ now.
-        reads: set[_Read] = {_ALL}
-        for change in changes:
-            entries = index_entries(change.before), index_entries(change.after)
-            reads |= {change.key.subject}.union(*entries)
-        stale = {unit for read in reads for unit in self._readers.pop(read, ())}
-
-        def keys_needed(world: World, subject: Subject) -> tuple[ReleaseKey, ...]:
-            return tuple(release_keys.keys_of(world, subject, strict=True))
-
-        for subject in ledger.claims:
-            if subject in stale or subject not in self._keys:
-                self._keys[subject] = self._traced(ledger, subject, keys_needed)
-        for subject in self._keys.keys() & stale:
-            if subject not in ledger.claims:
-                del self._keys[subject]
-        needed = {key for keys in self._keys.values() for key in keys}
-        gone = self._planned - needed
-        planned: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
-        for key in sorted(needed - self._planned | (needed & stale), key=repr):
-            planned[key] = self._traced(ledger, key, plan)
-        self._planned = needed
-        return planned
-
-    def _traced(self, ledger: Ledger, unit: Unit, work: Callable[[World, Unit], T]) -> T:
-        reads: set[_Read] = set()
-        traced = Ledger(
-            cast(Any, _Recording(ledger.claims, reads)),
-            cast(Any, _Recording(ledger.index, reads)),
-            cast(Any, None),  # planning does not read the ends of leases
-            ledger.ended,
-        )
-        result = work(World(self._config, traced), unit)
-        for read in reads:
-            self._readers.setdefault(read, set()).add(unit)
-        return result
-
-
-class _Recording:
-    def __init__(self, map: Any, reads: set[_Read]) -> None:  # noqa: ANN401 - either map
-        self._map, self._reads = map, reads
-
-    def get(self, key: _Read, default: Any = None) -> Any:  # noqa: ANN401
-        self._reads.add(key)
-        return self._map.get(key, default)
-
-    def __getitem__(self, key: _Read) -> Any:  # noqa: ANN401
-        self._reads.add(key)
-        return self._map[key]
-
-    def __contains__(self, key: _Read) -> bool:
-        self._reads.add(key)
-        return key in self._map
-
-    def __iter__(self) -> Iterator[Any]:
-        self._reads.add(_ALL)
-        return iter(self._map)
-
-    def values(self) -> Any:  # noqa: ANN401
-        self._reads.add(_ALL)
-        return self._map.values()

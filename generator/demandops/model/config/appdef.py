@@ -463,13 +463,13 @@ def _input_problems(
             yield f"uses.{name}", f"appdefs/{name}/service.yaml does not exist; add it{hint}"
             continue
         inputs = definitions[name].inputs
-        for role in inputs.keys() - bound.keys():
+        for role in sorted(inputs.keys() - bound.keys()):
             yield (
                 f"uses.{name}.{role}",
                 "is missing; say where the input comes from: an input of this definition, or "
                 "<service>.<output>",
             )
-        for role in bound.keys() - inputs.keys():
+        for role in sorted(bound.keys() - inputs.keys()):
             hint = suggestion(role, inputs)
             yield f"uses.{name}.{role}", f"'{name}' has no input '{role}'; leave it out{hint}"
     for service in services.values():

@@ -26,7 +26,7 @@ from pydantic_core import PydanticKnownError
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path, suggestion
-from demandops.base.naming import PATTERN_WORDS, control_character
+from demandops.base.naming import PATTERN_WORDS, control_character, one_form
 from demandops.base.quoting import quoted
 
 # ---- durations and times for people: ``1h30m``, ``in 10m``, ``3m20s ago`` ----
@@ -156,6 +156,11 @@ Visible = without(
 
 # Any text that `Visible` accepts
 Text = Annotated[str, Visible]
+
+# A validator that writes ids, and the patterns of ids, in one form
+OneForm = AfterValidator(one_form)
+
+Pattern = Annotated[Text, OneForm]
 
 Approval = Literal["none", "required"]
 

@@ -301,6 +301,7 @@ class ConfigReader:
                 name: Any = place
                 if key:
                     name = entry.get(key) if isinstance(entry, dict) else None
+                    name = naming.one_form(name) if isinstance(name, str) else None
                 at = (field, place)
                 if isinstance(name, str) and name in places:
                     self.add_duplicate(name, places[name], (file, field_path(at)), key)

@@ -285,7 +285,7 @@ ResourceName = Annotated[
 # How much of each resource a node has, or a service requests
 Resources = dict[ResourceName, Quantity]
 
-NodeId = Annotated[str, base_model.without(id_problem)]
+NodeId = Annotated[str, base_model.OneForm, base_model.without(id_problem)]
 Topic = Annotated[str, base_model.without(topic_problem)]
 MessageType = Annotated[str, base_model.without(message_type_problem)]
 

@@ -19,7 +19,14 @@ from demandops.base.errors import InvalidInput, sentences
 from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
 from demandops.model.config import base_model
-from demandops.model.config.base_model import DnsLabel, FileModel, FrozenModel, Items, Text, Visible
+from demandops.model.config.base_model import (
+    DnsLabel,
+    FileModel,
+    FrozenModel,
+    Items,
+    Pattern,
+    Visible,
+)
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.model.config.policy import matches
 from demandops.model.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
@@ -81,7 +88,7 @@ def _not_empty(items: tuple[Any, ...]) -> tuple[Any, ...]:
     return items
 
 
-Patterns = Annotated[Items[Text], AfterValidator(_not_empty)]
+Patterns = Annotated[Items[Pattern], AfterValidator(_not_empty)]
 Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)]
 
 

@@ -21,7 +21,7 @@ from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, F
 from demandops.model.config.inventory import Credentials, NodeId, RosDomainId
 
 Duration = Annotated[str, base_model.readable_by(base_model.seconds_of)]
-Patterns = Annotated[tuple[base_model.Text, ...], Field(strict=False, min_length=1)]
+Patterns = Annotated[tuple[base_model.Pattern, ...], Field(strict=False, min_length=1)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
@@ -185,7 +185,7 @@ class AccessDomain(CamelModel):
     name: DnsLabel
     namespace: DnsLabel
     service_account: DnsLabel = "demandops"
-    nodes: Items[base_model.Text] = ("*",)
+    nodes: Items[base_model.Pattern] = ("*",)
     rules: Items[Rule] = ()
     quotas: Quotas = Quotas()
     leases: LeasePolicy = LeasePolicy()

@@ -155,8 +155,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     version: str = ""
     connect: Annotated[str, type_word("auto", after=("none",))] = "auto"
     deliver: Items[Delivery] = ()
-    # The requirements on the node, kept to choose again; None if the demand names the node. One that
-    # requires nothing, as in each ROS message with a node, does not ask for a choice.
+    # The requirements on the node, kept to choose again; None if the demand names the node. A place
+    # that requires nothing, as in each ROS message with a node, does not ask for a choice.
     place: Annotated[
         Requirement | None, AfterValidator(lambda place: None if place == Requirement() else place)
     ] = None
@@ -334,6 +334,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ("takes", topic.source, topic.topic)
             if topic.application:
                 yield ("reads", topic.application)
+            yield ("from", topic.source)
             yield ("node", topic.source)
             if topic.further or self.separate:
                 yield ("further", topic.part_in(self.own_version))
@@ -510,12 +511,10 @@ class Demand:
         """Return what keeps demands that share it in their order; None touches everything."""
         if self.operation in ("decommission", "rollback"):
             return None
-        # Goals of the reference's action that share a requester keep their order. For example, of
-        # two equal shutdowns, the second has an effect only if a join came between them.
-        names = self.requesters() if self.is_reference else ()
         apps = (item.held for item in self.demanded if isinstance(item.held, Application))
         read = (Subject(SubjectKind.APPLICATION, id) for app in apps for id in app.read_outputs)
-        return frozenset((*self.subjects(), *read, ("demand", self.demand), *names))
+        own = [("demand", self.demand)] if self.demand else []
+        return frozenset((*self.subjects(), *read, *own))
 
 
 AnyDemand = TypeVar("AnyDemand", bound=Demand)

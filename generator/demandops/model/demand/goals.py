@@ -17,7 +17,7 @@ from pydantic import Field, PlainValidator, ValidationError
 
 from demandops.base import strict_yaml
 from demandops.base.errors import MOST_FAULTS, Fault, Refused, fault, field_path
-from demandops.base.naming import id_problem
+from demandops.base.naming import id_problem, one_form
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.connections.connection import Connection, Route
@@ -354,15 +354,16 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
         raise Refused([fault("", message)])
     if not isinstance(goal, dict):
         raise Refused([fault("", _NOT_A_MAPPING)])
-    faults = list(_keys_not_unicode(goal, ()))
+    faults: list[Fault] = []
+    data: dict[str, Any] = _in_one_form(goal, (), faults)
     if faults:
         raise Refused(faults)
-    if not is_demand_goal(goal):
-        demand = _parsed(WireGoal, goal, faults)
+    if not is_demand_goal(data):
+        demand = _parsed(WireGoal, data, faults)
     else:
-        united, faults = _with_parameters(goal)
+        united, faults = _with_parameters(data)
         demand = _parsed(DemandGoal, united, faults)
-    return replace(demand, goal=goal)
+    return replace(demand, goal=data)
 
 
 def _parsed(
@@ -389,17 +390,22 @@ def is_unicode(text: str) -> bool:
     return not any("\ud800" <= char <= "\udfff" for char in text)
 
 
-def _keys_not_unicode(value: object, location: tuple[int | str, ...]) -> Iterator[Fault]:
+# the values in these fields are the application's own, and stay as they are
+_OWN_VALUES = frozenset({"parameters", "parameters_json"})
+
+
+def _in_one_form(value: Any, location: tuple[int | str, ...], faults: list[Fault]) -> Any:  # noqa: ANN401
+    """Return plain data with its ids in one form of Unicode; collect a fault for each wrong key."""
     if isinstance(value, list):
-        for index, part in enumerate(value):
-            yield from _keys_not_unicode(part, (*location, index))
-    elif isinstance(value, dict):
-        for key, part in value.items():
-            if is_unicode(key):
-                yield from _keys_not_unicode(part, (*location, key))
-            else:
+        return [_in_one_form(part, (*location, at), faults) for at, part in enumerate(value)]
+    if isinstance(value, dict):
+        for key in value:
+            if not is_unicode(key):
                 message = f"the key {strict_yaml.short_repr(key)} is not text"
-                yield fault(field_path(location), f"{message}; write whole characters")
+                faults.append(fault(field_path(location), f"{message}; write whole characters"))
+        return {key: _in_one_form(part, (*location, key), faults) for key, part in value.items()}
+    is_id = isinstance(value, str) and _OWN_VALUES.isdisjoint(location)
+    return one_form(value) if is_id else value
 
 
 # ---- operators' demands, which no action and no file can express; only the journal has them ----

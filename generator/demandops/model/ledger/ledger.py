@@ -101,6 +101,11 @@ class Ledger:
     def claims_reading_outputs(self, application: str) -> tuple[Claim, ...]:
         return self._claims("reads", application)
 
+    def claims_from(self, node: str) -> Iterator[Claim]:
+        # that read a topic of the node or carry one from it, in no order
+        keys = self.index.get(("from", node)) or ()
+        return (claim for key in keys if (claim := self.get(key)))
+
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
         for claim in self.each_reading(source, topic):
             if inputs := claim.application.inputs_from(role, source, topic):

@@ -158,11 +158,15 @@ def check(
             for path in edited
         ]
         result = replace(result, suggestions=tuple(suggestions.values()))
-    ordered = sorted(dict.fromkeys(faults), key=lambda fault: fault.file)
     # an InvalidInput has only so many faults of one file
+    listed = with_lines(InvalidInput(dict.fromkeys(faults)).faults, files.get)
+
+    def place(fault: Fault) -> tuple[str, bool, int, str, str]:
+        return fault.file, fault.code == "more", fault.line or 0, fault.field, fault.message
+
     return replace(
         result,
-        faults=tuple(with_lines(InvalidInput(ordered).faults, files.get)),
+        faults=tuple(sorted(listed, key=place)),
         warnings=tuple(with_lines(InvalidInput(result.warnings).faults, files.get)),
     )
 

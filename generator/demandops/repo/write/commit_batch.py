@@ -56,7 +56,7 @@ class CommitBatch:
         self.start = start
         self.head = start
         # whether a demand freed room on a node since the caller last set this to false
-        self.frees = False
+        self.awaited = False
         # the log line about the follow commit, which renders people's changes; empty if none
         self.followed = ""
 
@@ -84,7 +84,7 @@ class CommitBatch:
             ]
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
-        self.frees = self.frees or decision.frees
+        self.awaited = self.awaited or decision.awaited
         author = commit_message.author(decision, received)
         return self.commit_files(decision.files, decision.state, text, author, now)
 

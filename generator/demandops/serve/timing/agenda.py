@@ -120,12 +120,12 @@ class WaitingTurns:
         self._tried = commits.head.state
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand, decided on ``before``, freed room."""
-        if commits.frees:
-            commits.frees = False
+        """Book waiting demands if the last demand, decided on ``before``, may have let them in."""
+        if commits.awaited:
+            commits.awaited = False
             self._tried = None
             self.book_due(commits)
-        elif self._tried is before:  # the last demand freed no room, so the tries are still valid
+        elif self._tried is before:  # the last demand let none in, so the tries are still valid
             self._tried = commits.head.state
 
     def is_due(self, state: State) -> bool:

@@ -2,8 +2,9 @@
 
 A person may set the clock. A clock that is set back only delays the end of a lease. A clock that
 jumps forward would end leases that were renewed in time, so after a jump every lease gets its
-full term again. The sleep of a machine looks like a jump and has the same effect. Overrides get no
-more time after a jump.
+full term again. The sleep of a machine looks like a jump and has the same effect. While no
+generator ran, nobody could renew a lease, so after a start no lease ends before its term, or ten
+minutes of a longer one, have passed. Overrides get no more time after a jump or a start.
 """
 
 from __future__ import annotations
@@ -26,8 +27,12 @@ log = logging.getLogger("demandops")
 
 # By how much the clock may gain on the monotonic clock before leases get their full term again.
 _JUMP = timedelta(seconds=30)
+# The longest grace after a start. A client that is alive and failed to renew tries again within it;
+# with more, a generator that is restarted each day would keep the day-long leases of vehicles that
+# are gone for ever.
+_LONGEST_GRACE_S = 600.0
 # The ledger keeps a lease that has ended if its release failed, or if it got more time after a jump
-# of the clock. Without this minimum, the worker would then never wait.
+# of the clock or a start. Without this minimum, the worker would then never wait.
 _SHORTEST_S = 1.0
 # The longest time between two checks of the leases; short, because a person may set the clock.
 LONGEST_WAIT_S = 60.0
@@ -38,7 +43,8 @@ RETRY = timedelta(seconds=LONGEST_WAIT_S)
 class LeaseExpiry:
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
-        self._last = (runtime.now(), runtime.monotonic())
+        self._started = runtime.monotonic()
+        self._last = (runtime.now(), self._started)
         self._jumped_at: datetime | None = None
         self._tried: dict[str, datetime] = {}
         self._first: object = None
@@ -74,8 +80,7 @@ class LeaseExpiry:
         """Return the current time, and the claims whose lease has ended, earliest end first."""
         now = self._read_clocks()
         ended = ledger.ended_claims(now)
-        # A demand's claims are released together. So if one gets more time after a jump of the
-        # clock, none is released.
+        # a demand's claims are released together, so if one gets more time, none is released
         granted = {claim.demand for claim in ended if not self._has_ended(claim, now)}
         return now, [claim for claim in ended if claim.demand not in granted]
 
@@ -97,9 +102,13 @@ class LeaseExpiry:
         return wall
 
     def _has_ended(self, claim: Claim, now: datetime) -> bool:
-        if claim.lease is None or self._jumped_at is None:
-            return claim.lease is not None
-        return now > self._jumped_at + timedelta(seconds=claim.lease.seconds + claim.lease.slack)
+        lease = claim.lease
+        if lease is None:
+            return False
+        if self._runtime.monotonic() - self._started < min(lease.seconds, _LONGEST_GRACE_S):
+            return False
+        term = timedelta(seconds=lease.seconds + lease.slack)
+        return self._jumped_at is None or now > self._jumped_at + term
 
 
 class OverrideExpiry:

@@ -1,0 +1,170 @@
+"""What goals of both actions list, as claims, and which goals are refused whatever is booked.
+
+Like :mod:`.books`, it is written from docs/demand.md and imports nothing of the program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+Goal = dict[str, Any]
+Item = dict[str, Any]
+
+Subject = tuple[str, str]
+"""A subject: its kind (``application`` or ``connection``) and its id."""
+
+Topic = tuple[str, ...]
+"""A topic: a connection's source topic, or an application's role, topic and source."""
+
+DETECTION_FUSION = 1
+MQTT = 1
+_CONNECTION_TYPES = (0, 1, 2)
+_BODY = "object_detection_fusion_app"
+
+
+@dataclass(frozen=True)
+class World:
+    nodes: frozenset[str]
+    brokers: frozenset[str]
+
+
+@dataclass
+class Claim:
+    """``fixed`` has type and nodes; ``topics`` has the target of each topic of a connection."""
+
+    fixed: dict[str, Any]
+    broker: str
+    topics: dict[Topic, str]
+    who: tuple[str, ...]
+
+    def contradicts(self, other: Claim) -> bool:
+        # brokers contradict each other only if both connections name one
+        return (
+            self.fixed != other.fixed
+            or (self.broker != other.broker and "" not in (self.broker, other.broker))
+            or any(other.topics.get(one, to) != to for one, to in self.topics.items())
+        )
+
+    def means(self, claim: Claim) -> bool:
+        # of a shutdown, which may leave fields out; its broker does not matter
+        return all(value in ("", claim.fixed[name]) for name, value in self.fixed.items())
+
+
+def absolute(topic: str) -> str:
+    """Return the absolute name of a topic, as ROS resolves it in the root namespace."""
+    return topic if topic.startswith("/") else f"/{topic}"
+
+
+def requesters(item: Item) -> list[str]:
+    body = item.get(_BODY, {}) if "header" in item else item
+    return list(body.get("requester_ids", []))
+
+
+def items(goal: Goal, world: World) -> Iterator[tuple[Subject, Claim]]:
+    if goal.get("kind") == "Demand":
+        yield from _own_items(goal)
+        return
+    for app in goal.get("apps", []):
+        fixed = {"type": app.get("type", 0), "node": app["header"].get("node_id", "")}
+        topics = dict.fromkeys(_inputs(app), "")
+        who = tuple(sorted({*requesters(app)}))
+        yield ("application", app["header"]["id"]), Claim(fixed, "", topics, who)
+    for item in goal.get("connections", []):
+        fixed = {"type": item.get("type", 0)}
+        fixed |= {end: item.get(f"{end}_node_id", "") for end in ("source", "target")}
+        routes = {(source,): target for source, target in _pairs(item)}
+        who = tuple(sorted({*requesters(item)}))
+        yield ("connection", item["id"]), Claim(fixed, _broker(item, world), routes, who)
+
+
+def _broker(item: Item, world: World) -> str:
+    # "" if it names none
+    asked, brokers = item.get("broker_node_id", ""), world.brokers
+    ends = (item.get("target_node_id", ""), item.get("source_node_id", ""))
+    found = [*brokers][:1] if len(brokers) == 1 else [n for n in (asked, *ends) if n in brokers]
+    return found[0] if asked and found else ""
+
+
+def _own_items(goal: Goal) -> Iterator[tuple[Subject, Claim]]:
+    who = tuple(sorted({*goal["requesters"]}))
+    for app in goal.get("applications", []):
+        inputs = {
+            (role, absolute(topic["topic"]), topic["source"]): ""
+            for role, topics in app["inputs"].items()
+            for topic in topics
+        }
+        fixed = {"type": DETECTION_FUSION, "node": app["node"]}
+        yield ("application", app["id"]), Claim(fixed, "", inputs, who)
+    for item in goal.get("connections", []):
+        fixed = {"type": MQTT, "source": item["source"], "target": item["target"]}
+        routes = {(absolute(one["source"]),): absolute(one["target"]) for one in item["topics"]}
+        yield ("connection", item["id"]), Claim(fixed, item.get("broker", ""), routes, who)
+
+
+def inadmissible(goal: Goal, world: World) -> Iterator[str]:
+    if goal.get("kind") == "Demand":  # those that the tests make have no such faults
+        return
+    joining = not goal.get("shutdown", False)
+    listed = [*goal.get("apps", []), *goal.get("connections", [])]
+    if not listed:
+        yield "nothing is listed"
+    for item in listed:
+        if not requesters(item) or "" in requesters(item):
+            yield "nobody asks"
+    for app in goal.get("apps", []):
+        yield from _inadmissible_application(app, joining, world)
+    for connection in goal.get("connections", []):
+        yield from _inadmissible_connection(connection, joining, world)
+
+
+def _inadmissible_application(app: Item, joining: bool, world: World) -> Iterator[str]:
+    if not app["header"].get("id"):
+        yield "an application has no id"
+    if app.get("type", 0) != DETECTION_FUSION:
+        yield "no such type of application"
+    if not joining:
+        return
+    sources = {source for _, _, source in _inputs(app)}
+    if not sources:
+        yield "an application without topics"
+    if not {app["header"].get("node_id", ""), *sources} <= world.nodes:
+        yield "an unknown node"
+
+
+def _inadmissible_connection(connection: Item, joining: bool, world: World) -> Iterator[str]:
+    sources = connection.get("source_topics", [])
+    targets = connection.get("target_topics", [])
+    if not connection.get("id"):
+        yield "a connection has no id"
+    if len(sources) != len(targets):
+        yield "source and target topics do not pair"
+    if connection.get("type", 0) not in _CONNECTION_TYPES:
+        yield "no such type of connection"
+    if len(dict(_pairs(connection))) < len(set(_pairs(connection))):
+        yield "one source topic with two targets"
+    if not joining:
+        return
+    if connection.get("type", 0) != MQTT:
+        yield "the inventory allows only MQTT connections"  # the inventory has no bridges
+    if not sources:
+        yield "a connection without topics"
+    ends = connection.get("source_node_id", ""), connection.get("target_node_id", "")
+    if not set(ends) <= world.nodes:
+        yield "an unknown node"
+    asked, brokers = connection.get("broker_node_id", ""), world.brokers
+    if not {asked, *ends} & brokers and len(brokers) != 1:
+        yield "no broker"
+
+
+def _inputs(app: Item) -> Iterator[Topic]:
+    for role, field in (("ego_data", "ego_data_topics"), ("point_cloud", "pointcloud_topics")):
+        for topic in app.get(_BODY, {}).get(field, []):
+            yield role, absolute(topic["topic_name"]), topic.get("source_node_id", "")
+
+
+def _pairs(item: Item) -> list[tuple[str, str]]:
+    sources, targets = item.get("source_topics", []), item.get("target_topics", [])
+    pairs = zip(sources, targets, strict=False)  # a request whose topics do not pair is refused
+    return [(absolute(source), absolute(target)) for source, target in pairs]

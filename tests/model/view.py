@@ -1,0 +1,113 @@
+"""The bookkeeping of the model, and that of the program in the same words."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from tests.model.books import Books
+from tests.model.listed import Claim
+
+
+def view(books: Books) -> dict[str, Any]:
+    return {"services": _services(books), "connections": _connections(books)}
+
+
+def _services(books: Books) -> dict[tuple[str, str, str], dict[str, Any]]:
+    # who requests each service: (service, node, point cloud or application)
+    found: dict[tuple[str, str, str], dict[str, Any]] = {}
+
+    def read(
+        key: tuple[str, str, str], app: str, role: str, topic: str, who: Iterable[str]
+    ) -> None:
+        new: dict[str, Any] = {"applications": set(), "inputs": {}, "requesters": set()}
+        entry = found.setdefault(key, new)
+        entry["applications"].add(app)
+        entry["requesters"] |= {*who}
+        entry["inputs"].setdefault(role, {}).setdefault(topic, set()).update(who)
+
+    for id, claim in _on("application", books):
+        node, who = claim.fixed["node"], claim.who
+        for role, topic, source in claim.topics:
+            if role == "ego_data":
+                read(("object-fusion", node, id), id, role, topic, who)
+                continue
+            cloud = f"{source} {topic}"
+            read(("object-fusion", node, id), id, "object_list", cloud, who)
+            read(("object-detection", node, cloud), id, "point_cloud", topic, who)
+    return _sorted(found)  # type: ignore[no-any-return]
+
+
+def _connections(books: Books) -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = {}
+    for id, claim in _on("connection", books):
+        ends = {end: claim.fixed[end] for end in ("source", "target")}
+        entry = found.setdefault(id, {**ends, "topics": {}, "requesters": set()})
+        entry["requesters"] |= {*claim.who}
+        for (topic,) in claim.topics:
+            entry["topics"].setdefault(topic, set()).update(claim.who)
+    return _sorted(found)  # type: ignore[no-any-return]
+
+
+def _on(kind: str, books: Books) -> Iterator[tuple[str, Claim]]:
+    return ((id, claim) for ((of, id), _), claim in books.claims.items() if of == kind)
+
+
+def _sorted(value: Any) -> Any:
+    """Return plain data in which sets have become sorted lists."""
+    if isinstance(value, dict):
+        return {key: _sorted(inner) for key, inner in value.items()}
+    return sorted(value) if isinstance(value, set) else value
+
+
+def in_model_words(
+    data: Mapping[str, Any], object_lists: Mapping[tuple[str, str], str]
+) -> dict[str, Any]:
+    """Return the program's bookkeeping as :func:`view` gives it."""
+    services = {}
+    for entry in data["services"].values():
+        node = entry["node"]
+        if entry["source"] is None:
+            (subject,) = entry["applications"]
+        else:
+            subject = f"{entry['source']} {entry['source_topic']}"
+        key = (entry["service"], node, subject)
+        assert key not in services, f"{key} appears twice"
+        for topics in entry["inputs"].values():
+            assert list(topics) == sorted(topics), topics
+        inputs = {role: topics for role, topics in entry["inputs"].items() if topics}
+        if "object_list" in inputs:
+            inputs["object_list"] = {
+                object_lists.get((node, topic), f"published by nobody: {topic}"): who
+                for topic, who in inputs["object_list"].items()
+            }
+        services[key] = {name: entry[name] for name in ("applications", "requesters")} | {
+            "inputs": inputs
+        }
+    told = ("source", "target", "topics", "requesters")
+    connections = {
+        id: {name: entry[name] for name in told} for id, entry in data["connections"].items()
+    }
+    return {"services": services, "connections": connections}
+
+
+def object_lists(manifests: Iterable[str]) -> dict[tuple[str, str], str]:
+    """Map (node, topic of an object list) to the point cloud that releases make it from."""
+    found: dict[tuple[str, str], str] = {}
+    for text in manifests:
+        published = re.search(r"objectListTopic: (\S+)", text)
+        if not published:
+            continue
+        node, source, topic = (
+            _only(rf'demandops/{name}: "(.*)"', text) for name in ("node", "source", "source-topic")
+        )
+        assert topic == _only("pointCloudTopic: (.*)", text)
+        assert (node, published[1]) not in found, f"two detections on {node}: {published[1]}"
+        found[node, published[1]] = f"{source} {topic}"
+    return found
+
+
+def _only(pattern: str, text: str) -> str:
+    (found,) = set(re.findall(pattern, text))
+    return str(found)
