@@ -316,7 +316,7 @@ def with_implied_connections(request: AnyDemand, ledger: Ledger, config: Config)
     }
     for item in request.demanded:
         app = item.held
-        if not isinstance(app, Application) or app.connect == "none":
+        if not isinstance(app, Application):
             continue
         places: dict[TopicKey, str] = {
             (role, topic.topic, topic.source): f"inputs.{role}[{index}]"
@@ -333,7 +333,11 @@ def with_implied_connections(request: AnyDemand, ledger: Ledger, config: Config)
             )
             if (flow.receiver, flow.target) in brought or not is_valid:
                 continue
-            needed = connection_for(flow, app.connect, ledger)
+            # what is held for its readers keeps the connections that bring its inputs now
+            carrier = carrier_of(flow, ledger) if app.held_for else None
+            if app.connect == "none" and carrier is None:
+                continue
+            needed = carrier or connection_for(flow, app.connect, ledger)
             field = item.needed_by or places.get(flow.root, "node")
             if flow.delivery is not None:
                 field = f"deliver[{flow.delivery}]"
@@ -390,6 +394,17 @@ def without_idle_deliveries(
                     ledger = ledger.replace(key, replace(claim, held=held) if held else None)
                     keys.append(key)
     return ledger, replace(changes, claims=claim_changes(before, ledger, keys))
+
+
+def carrier_of(flow: Flow, ledger: Ledger) -> Connection | None:
+    """Return a claimed connection that brings a flow's target, from any topic of any sender."""
+    for id in ledger.connections_bringing(flow.receiver, flow.target):
+        for connection in (claim.connection for claim in ledger.connection_claims(id)):
+            for route in connection.topics:
+                _, receiver = route.sender_and_receiver(*connection.nodes)
+                if (receiver, route.written_topic) == (flow.receiver, flow.target):
+                    return replace(connection, broker="", topics=(route,))
+    return None
 
 
 def connection_for(flow: Flow, type: str, ledger: Ledger) -> Connection:
