@@ -100,6 +100,7 @@ def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
     inputs: dict[str, list[dict[str, str]]] = {}
     for item in app.inputs:
         inputs.setdefault(item.role, []).append(_data(item, _INPUT))
+    connect = _word(_TYPES, app.connect)
     return {
         **_data(app, _APPLICATION),
         "services": {
@@ -107,7 +108,9 @@ def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
         },
         "inputs": inputs,
         "parameters_json": {parameter.name: parameter.value_json for parameter in app.parameters},
-        "connect": _word(_TYPES, app.connect),
+        "connect": {"type": connect, "broker": app.connect_broker}
+        if app.connect_broker
+        else connect,
         "place": _data(app, _PLACE),
         "deliver": [_data(delivery, _DELIVERY) for delivery in app.deliver],
     }
@@ -117,6 +120,9 @@ def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     others = {"inputs", "parameters", "parameters_json", "connect", "place", "deliver", "services"}
     values = {name: json.dumps(value) for name, value in data.get("parameters", {}).items()}
     values |= data.get("parameters_json", {})
+    connect = data.get("connect", "auto")
+    if isinstance(connect, str):
+        connect = {"type": connect}
     return _message(
         messages.Application,
         **_fields(data, _APPLICATION, others, "an application"),
@@ -135,7 +141,8 @@ def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
             _message(messages.Parameter, name=name, value_json=text)
             for name, text in values.items()
         ],
-        connect=_number(_TYPES, data.get("connect", "auto"), "connect"),
+        connect=_number(_TYPES, connect.get("type", "auto"), "connect"),
+        **_fields(connect, {"broker": "connect_broker"}, {"type"}, "connect"),
     )
 
 

@@ -92,10 +92,13 @@ def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> Non
     decision = repo.send(demand())
     services = {entry["service"] for entry in repo.books()["services"].values()}
     assert services == {"object-detection", "object-fusion"}
-    assert list(repo.books()["connections"]) == ["derived/vehicle00/edge"]
+    assert list(repo.books()["connections"]) == [
+        "derived/vehicle00/edge/vehicles/vehicle00/drivers/lidar/pointcloud",
+        "derived/vehicle00/edge/vehicles/vehicle00/ego_data",
+    ]
     assert (decision.lease_s, decision.warnings) == (600, ())
     goal = data("demand.md", "id: station00/collective-perception")
-    assert len(MemoryRepo().send(goal).changes.claims) == 2
+    assert len(MemoryRepo().send(goal).changes.claims) == 3
 
 
 def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:

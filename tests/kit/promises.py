@@ -79,18 +79,20 @@ class Maker:
         }
 
     def _connection(self, id: str) -> dict[str, Any]:
-        topics = [{"source": f"/{name}"} for name in self._some("pq")]
+        # no other connection has them, so the model needs not know which one carries a topic
+        topics = [{"source": f"/{id}{name}"} for name in self._some("pq")]
         if not self._random.randrange(6):
-            topics = [{"source": "/p", "target": "/elsewhere"}]
+            topics = [{"source": f"/{id}p", "target": "/elsewhere"}]
         source = "station00" if not self._random.randrange(6) else "vehicle00"
-        topics = topics or [{"source": "/r"}]
+        topics = topics or [{"source": f"/{id}r"}]
         return {"id": id, "source": source, "target": "edge", "topics": topics}
 
     def _message(self, *, shutdown: bool) -> Goal:
-        topics = [f"/{name}" for name in self._some("pq")]
-        topics = topics if shutdown else topics or ["/p"]
+        id = self._random.choice("xy")
+        topics = [f"/{id}{name}" for name in self._some("pq")]
+        topics = topics if shutdown else topics or [f"/{id}p"]
         item = {
-            "id": self._random.choice("xy"),
+            "id": id,
             "type": 1,
             "requester_ids": self._some(PEOPLE) or [PEOPLE[0]],
             "source_node_id": "vehicle00",

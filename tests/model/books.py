@@ -1,4 +1,4 @@
-"""The bookkeeping of both actions in a hundred lines, written only from docs/demand.md.
+"""The bookkeeping of both actions in two hundred lines, written only from docs/demand.md.
 
 It imports nothing of the program and shares no idea with it, so a mistake stays unnoticed only if
 both make it. Where the docs leave something open, a comment says what this model does.
@@ -10,7 +10,18 @@ from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
 
-from tests.model.listed import Claim, Goal, Subject, Topic, World, inadmissible, items
+from tests.model.listed import (
+    MQTT,
+    Claim,
+    Goal,
+    Route,
+    Subject,
+    Topic,
+    World,
+    cannot_carry,
+    inadmissible,
+    items,
+)
 
 Demand = tuple[str, tuple[str, ...]]
 """A request id and its sorted requesters; or the id of a ``Demand``, and nobody."""
@@ -47,8 +58,7 @@ class Books:
             elif gives_up:
                 not_held = list(self._shut_down(goal))
             else:
-                for subject, claim in items(goal, self.world):
-                    self._add((subject, (goal.get("id", ""), claim.who)), claim)
+                self._join(goal)
         except _Refused as refusal:
             self.claims = before
             return Result("refused", str(refusal))
@@ -57,33 +67,149 @@ class Books:
         outcome = "released" if gives_up else "booked" if touched else "unchanged"
         return Result(outcome, "", tuple(not_held), touched)
 
-    def _add(self, key: Key, claim: Claim) -> None:
+    def _join(self, goal: Goal) -> None:
+        listed = [
+            (subject, claim, goal.get("id", "")) for subject, claim in items(goal, self.world)
+        ]
+        brought = {route[2:] for _, claim, _ in listed for route in claim.routes()}
+        for subject, claim, id in listed:
+            self._add((subject, (id, claim.who)), claim)
+        for subject, claim, id in listed:
+            if subject[0] == "application":
+                self._imply(claim, (id, claim.who), brought)
+
+    def _add(self, key: Key, claim: Claim, former: dict[Key, Claim] | None = None) -> None:
+        """Add what an item lists; each topic of a connection goes to the one that carries it."""
+        if key[0][0] == "application":
+            self._unite(key, claim)
+        for route, topic in claim.routes().items() if key[0][0] == "connection" else ():
+            carrier = self._carrier(route, key[1], former or {}) or key[0]
+            one = Claim(claim.fixed, claim.broker, {topic: claim.topics[topic]}, claim.who)
+            one.listed = {topic: key[0][1]}
+            self._carry((carrier, key[1]), one, is_new=carrier == key[0])
+
+    def _carrier(self, route: Route, demand: Demand, former: dict[Key, Claim]) -> Subject | None:
+        found = {
+            key: claim
+            for key, claim in {**former, **self.claims}.items()
+            if key[0][0] == "connection" and route in claim.routes()
+        }
+        own = [key[0] for key in found if key[1] == demand]
+        return min(own or [key[0] for key in found], default=None)
+
+    def _carry(self, key: Key, one: Claim, *, is_new: bool) -> None:
+        standing = [claim for (subject, _), claim in self.claims.items() if subject == key[0]]
+        if standing:
+            broker = next((claim.broker for claim in standing if claim.broker), "")
+            ends = {name: one.fixed[name] for name in ("source", "target")}
+            one.fixed, one.broker = {**standing[0].fixed, **ends}, broker
+        if is_new and (problem := cannot_carry(one, self.world)):
+            raise _Refused(problem)
+        self._unite(key, one)
+
+    def _unite(self, key: Key, claim: Claim) -> None:
         others = (other for (subject, _), other in self.claims.items() if subject == key[0])
         if any(map(claim.contradicts, others)):
             raise _Refused("it contradicts a claim on the same subject")
         mine = self.claims.setdefault(key, claim)
         mine.topics = {**mine.topics, **claim.topics}
+        # what a goal lists stays listed under the first id
+        kept = {topic: id for topic, id in mine.listed.items() if id is not None}
+        mine.listed = {**mine.listed, **claim.listed, **kept}
         mine.broker = mine.broker or claim.broker
+
+    def _imply(self, app: Claim, demand: Demand, brought: set[tuple[str, ...]]) -> None:
+        """Add what an application reads from another node, and no goal of the demand lists."""
+        node = app.fixed["node"]
+        for _, topic, source in app.topics:
+            if source == node or (node, topic) in brought:
+                continue
+            bringing = [
+                (key[1] != demand, route[1] != topic, key[0], route, claim.listed[one])
+                for key, claim in self.claims.items()
+                if key[0][0] == "connection"
+                for route, one in claim.routes().items()
+                if route[2:] == (node, topic)
+                and (route[0] == source or (key[1] == demand and claim.listed[one] is not None))
+            ]
+            first = min(bringing, default=None, key=lambda each: each[:3])
+            if first and not first[0] and first[4] is not None:
+                continue
+            name = first[3][1] if first else topic
+            fixed = {"type": MQTT, "source": source, "target": node}
+            one = Claim(fixed, "", {(name,): topic}, demand[1], {(name,): None})
+            derived = "connection", f"derived/{source}/{node}{name}"
+            carrier = self._carrier((source, name, node, topic), demand, {})
+            self._carry((carrier or derived, demand), one, is_new=False)
 
     def _shut_down(self, goal: Goal) -> Iterator[tuple[str, Topic | None, tuple[str, ...]]]:
         taken = dict[Key, set[Topic]]()
         for subject, listed in items(goal, self.world):
-            key = subject, (goal.get("id", ""), listed.who)
-            claim = self.claims.get(key)
-            if claim is None or not listed.means(claim):
-                yield subject[1], None, listed.who
-                continue
-            named = {*(listed.topics or claim.topics)}
+            demand = goal.get("id", ""), listed.who
+            held = list(self._held(subject, listed, demand))
             # what the goal lists twice is held until the whole goal is carried out
-            taken.setdefault(key, set()).update(named & claim.topics.keys())
-            yield from ((subject[1], topic, listed.who) for topic in named - claim.topics.keys())
-        if not any(taken.values()):
+            for _, key, topic in held:
+                taken.setdefault(key, set()).add(topic)
+            found = {topic for topic, _, _ in held}
+            claim = self.claims.get((subject, demand))
+            if claim and not listed.means(claim):
+                claim = None
+            if not listed.topics or (not found and claim is None):
+                yield from [(subject[1], None, listed.who)] * (not found)
+                continue
+            yield from ((subject[1], topic, listed.who) for topic in {*listed.topics} - found)
+        if not taken:
             raise _Refused("nothing that it lists is held")
         for key, gone in taken.items():
-            topics = self.claims[key].topics
-            self.claims[key].topics = {one: to for one, to in topics.items() if one not in gone}
-            if not self.claims[key].topics:
-                del self.claims[key]
+            self._take(key, gone)
+        for demand in {demand for (subject, demand) in taken if subject[0] == "application"}:
+            self._end_implied(demand)
+
+    def _held(
+        self, subject: Subject, listed: Claim, demand: Demand
+    ) -> Iterator[tuple[Topic, Key, Topic]]:
+        """Yield (topic as listed, claim, topic there) for what the demand holds of an item."""
+        for key, claim in self.claims.items():
+            if key[1] != demand or key[0][0] != subject[0]:
+                continue
+            if subject[0] == "application":
+                topics = listed.topics or claim.topics
+                if key[0] == subject and listed.means(claim):
+                    yield from ((topic, key, topic) for topic in topics if topic in claim.topics)
+                continue
+            if not listed.means(claim):
+                continue
+            for topic, id in claim.listed.items() if not listed.topics else ():
+                if id == subject[1]:
+                    yield topic, key, topic
+            for topic, target in listed.topics.items():
+                if claim.topics.get(topic) == target or (
+                    key[0] == subject and topic in claim.topics
+                ):
+                    yield topic, key, topic
+
+    def _take(self, key: Key, gone: set[Topic]) -> None:
+        claim = self.claims[key]
+        claim.topics = {one: to for one, to in claim.topics.items() if one not in gone}
+        claim.listed = {one: id for one, id in claim.listed.items() if one not in gone}
+        if not claim.topics:
+            del self.claims[key]
+
+    def _end_implied(self, demand: Demand) -> None:
+        needed = {
+            (source, claim.fixed["node"], topic)
+            for (subject, of), claim in self.claims.items()
+            if subject[0] == "application" and of == demand
+            for _, topic, source in claim.topics
+        }
+        for key, claim in list(self.claims.items()):
+            if key[0][0] == "connection" and key[1] == demand:
+                idle = {
+                    one
+                    for route, one in claim.routes().items()
+                    if claim.listed[one] is None and (route[0], *route[2:]) not in needed
+                }
+                self._take(key, idle)
 
     def _own(self, goal: Goal) -> None:
         demand, who = (goal["demand"], ()), tuple(sorted({*goal["requesters"]}))
@@ -96,4 +222,4 @@ class Books:
         for key in held if operation != "renew" else ():
             del self.claims[key]
         for subject, claim in items(goal, self.world):
-            self._add((subject, demand), claim)
+            self._add((subject, demand), claim, held)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from dataclasses import field as field_of
 from typing import Any
 
 Goal = dict[str, Any]
@@ -17,6 +18,9 @@ Subject = tuple[str, str]
 
 Topic = tuple[str, ...]
 """A topic: a connection's source topic, or an application's role, topic and source."""
+
+Route = tuple[str, str, str, str]
+"""Source node, topic there, target node, topic there."""
 
 DETECTION_FUSION = 1
 MQTT = 1
@@ -32,24 +36,38 @@ class World:
 
 @dataclass
 class Claim:
-    """``fixed`` has type and nodes; ``topics`` has the target of each topic of a connection."""
+    """``fixed`` has type and nodes; ``topics`` has the target of each topic of a connection.
+
+    ``listed`` has the id that the demand lists for a topic of a connection, and None if no goal
+    lists the topic, but an application needs it.
+    """
 
     fixed: dict[str, Any]
     broker: str
     topics: dict[Topic, str]
     who: tuple[str, ...]
+    listed: dict[Topic, str | None] = field_of(default_factory=dict)
 
     def contradicts(self, other: Claim) -> bool:
-        # brokers contradict each other only if both connections name one
-        return (
-            self.fixed != other.fixed
-            or (self.broker != other.broker and "" not in (self.broker, other.broker))
-            or any(other.topics.get(one, to) != to for one, to in self.topics.items())
+        # a connection keeps its type and broker, whatever is demanded
+        mine, theirs = ({**claim.fixed} for claim in (self, other))
+        if "source" in mine:
+            mine["type"] = theirs["type"]
+        return mine != theirs or any(
+            other.topics.get(one, to) != to for one, to in self.topics.items()
         )
 
     def means(self, claim: Claim) -> bool:
-        # of a shutdown, which may leave fields out; its broker does not matter
+        # of a shutdown, which may leave nodes out; a connection's type and broker do not matter
+        if "source" in self.fixed:
+            mine, ends = ({c.fixed["source"], c.fixed["target"]} for c in (self, claim))
+            return mine - {""} <= ends
         return all(value in ("", claim.fixed[name]) for name, value in self.fixed.items())
+
+    def routes(self) -> dict[Route, Topic]:
+        """Return the topics of a connection by what they are at both ends."""
+        ends = self.fixed.get("source", ""), self.fixed.get("target", "")
+        return {(ends[0], one[0], ends[1], to): one for one, to in self.topics.items()}
 
 
 def absolute(topic: str) -> str:
@@ -146,16 +164,19 @@ def _inadmissible_connection(connection: Item, joining: bool, world: World) -> I
         yield "one source topic with two targets"
     if not joining:
         return
-    if connection.get("type", 0) != MQTT:
-        yield "the inventory allows only MQTT connections"  # the inventory has no bridges
     if not sources:
         yield "a connection without topics"
     ends = connection.get("source_node_id", ""), connection.get("target_node_id", "")
     if not set(ends) <= world.nodes:
         yield "an unknown node"
-    asked, brokers = connection.get("broker_node_id", ""), world.brokers
-    if not {asked, *ends} & brokers and len(brokers) != 1:
-        yield "no broker"
+
+
+def cannot_carry(claim: Claim, world: World) -> str:
+    """Return why a connection cannot carry what is new on it."""
+    if claim.fixed["type"] != MQTT:
+        return "the inventory allows only MQTT connections"  # the inventory has no bridges
+    ends = {claim.broker, claim.fixed["source"], claim.fixed["target"]}
+    return "" if ends & world.brokers or len(world.brokers) == 1 else "no broker"
 
 
 def _inputs(app: Item) -> Iterator[Topic]:

@@ -24,8 +24,7 @@ from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import in_turn
-from demandops.serve.timing.expiry import LeaseExpiry
-from demandops.serve.timing.pauses_and_limits import RateLimit
+from demandops.serve.agenda import LeaseExpiry, RateLimit
 from pydantic import Field, model_validator
 
 from tests.kit import plain_yaml

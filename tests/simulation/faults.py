@@ -33,14 +33,10 @@ from demandops.repo.load import snapshot
 from demandops.repo.write import journal
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.proposal_branch import ProposalBranches
-from demandops.serve import demand_lifecycle, generator
+from demandops.serve import agenda, demands
+from demandops.serve.agenda import Draining, LeaseExpiry, WaitingTurns
 from demandops.serve.approvals.approvals import Approvals
-from demandops.serve.demand_lifecycle import Demands
-from demandops.serve.evaluation import Evaluator
-from demandops.serve.queue import Receipt, Ticket
-from demandops.serve.timing import agenda, expiry
-from demandops.serve.timing.agenda import Draining, WaitingTurns
-from demandops.serve.timing.expiry import LeaseExpiry
+from demandops.serve.demands import Demands, Receipt, Ticket
 from demandops.serve.worker import Worker
 
 Wrong = Callable[..., Any]
@@ -269,10 +265,14 @@ plant("run_what_is_denied", 26, release_keys, "without_suspended", itself)
 plant("book_what_is_denied", 27, quotas, "denial_faults", lambda *_: ())
 
 
-@wrong(6, expiry, "expired_overrides")
 @wrong(10, relocation, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
+
+
+@wrong(6, agenda, "_ends")
+def end_overrides_early_one_by_one(ends: Any, state: Any) -> Any:
+    return [(end - timedelta(minutes=2), name) for end, name in ends(state)]
 
 
 # ---- publishing ----
@@ -375,10 +375,10 @@ def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
 
 
 plant("resume_in_reverse", 1, journal, "read", lambda read, path: dict([*read(path).items()][::-1]))
-plant("skip_the_search_for_operations", 22, Evaluator, "published_before", lambda *_: [])
+plant("skip_the_search_for_operations", 22, Worker, "_published_before", lambda *_: [])
 
 
-@wrong(30, generator.state_in_effect, "first_snapshot")
+@wrong(30, snapshot, "first_snapshot")
 def start_without_overrides(first: Any, *given: Any) -> Any:
     found = first(*given)
     config = replace(found.state.config, overrides={})
@@ -394,10 +394,10 @@ _known = set[str]()
 """The demands whose proposals a generator has forgotten at a restart."""
 
 
-def _forget_proposal(resumed: Any, entry: Any) -> Ticket:
-    if entry.proposal:
-        _known.add(entry.goal.get("demand", ""))
-    return resumed(replace(entry, proposal=None))
+def _forget_proposal(resumed: Any, record: Any) -> Ticket:
+    if record.get("proposal"):
+        _known.add(record["goal"].get("demand", ""))
+    return resumed({key: value for key, value in record.items() if key != "proposal"})
 
 
 @wrong(6, permission, "approval_reasons")
@@ -406,5 +406,5 @@ def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> tup
 
 
 FAULTS["skip_approval_after_a_restart"].parts.append(
-    (demand_lifecycle, "ticket_from_journal", _forget_proposal)
+    (demands, "ticket_from_journal", _forget_proposal)
 )

@@ -13,7 +13,7 @@ from typing import Any
 
 import pygit2
 from demandops.repo.git.repository import MAIN
-from demandops.serve.timing.expiry import LONGEST_WAIT_S
+from demandops.serve.agenda import LONGEST_WAIT_S
 
 from tests.kit import plain_yaml, repo
 from tests.kit.config import texts_below
@@ -148,6 +148,8 @@ class History:
         if joins and self.chance.randrange(3):
             (item,), known = made["connections"], self.chance.choice(joins)
             who = {name: known["connections"][0][name] for name in ("id", "requester_ids")}
+            topics = [f"/{who['id']}{topic[-1]}" for topic in item["source_topics"]]
+            who |= {"source_topics": topics, "target_topics": topics}
             made |= {"id": known["id"], "connections": [item | who]}
         return made
 
@@ -292,7 +294,7 @@ class History:
         self.oracle.check()
         if found := sorted(self._files("ledger/waiting").items()):
             path, text = self.chance.choice(found)
-            demand = plain_yaml.load(text)["demand"]
+            demand = plain_yaml.load(text)["goal"]["demand"]
             self.oracle.edits[self._commit({path: None})] = lambda books: books.waiting.pop(demand)
 
     def _move_channel(self) -> None:

@@ -7,15 +7,16 @@ from bisect import bisect_left
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
-from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar
 
 from pydantic import Field, PlainSerializer, PlainValidator, Strict, StrictBool
+from pydantic.json_schema import SkipJsonSchema
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.base.quoting import quoted
-from demandops.model.config.base_model import PART, Items, plain_number, without
+from demandops.model.config.base_model import PART, RECORDED, Items, plain_number, without
 from demandops.model.config.config import CLIENTS_FILE, Config, ConfigReader
 from demandops.model.config.inventory import Node
 from demandops.model.config.override import UNSHAPED, Shaping, patched_settings
@@ -55,6 +56,10 @@ class Route:
     queue: Annotated[int, Strict(), Field(ge=0, le=100_000)] = 0
     # the highest one in Hz; 0 for all messages
     rate: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False), plain_number] = 0.0
+    # What the generator records in a claim: an application of the demand needs the route, and no
+    # goal lists it; or the goal lists it under this id, and the claim's connection carries it.
+    implied: Annotated[StrictBool, RECORDED, SkipJsonSchema()] = False
+    listed: Annotated[str, RECORDED, SkipJsonSchema()] = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source", naming.absolute_topic(self.source))
@@ -86,7 +91,9 @@ class Route:
 
 
 _DEFAULTS = tuple(
-    (item.name, item.default) for item in fields(Route) if item.name not in ("source", "target")
+    (item.name, item.default)
+    for item in fields(Route)
+    if item.name not in ("source", "target", "implied", "listed")
 )
 
 
@@ -144,9 +151,23 @@ def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
     merged: dict[str, Route] = {}
     for route in routes:
         first = merged.get(route.source)
-        if first is None or (route.type and not first.type):
+        if first is None:
             merged[route.source] = route
+        elif first != route:
+            listed = route.listed if first.implied else first.listed
+            better = route if route.type and not first.type else first
+            implied = first.implied and route.implied
+            merged[route.source] = replace(better, implied=implied, listed=listed)
     return tuple(merged[source] for source in sorted(merged))
+
+
+class RouteKey(NamedTuple):
+    """The identity of a route: its topic at both ends. At most one connection carries it."""
+
+    sender: str  # the node that its messages come from
+    topic: str  # its name there
+    receiver: str
+    target: str
 
 
 # ---- connections ----
@@ -210,6 +231,14 @@ class Connection:
         candidate = self.topics[place : place + 1]
         return candidate[0] if candidate and candidate[0].source == source else None
 
+    def key_of(self, route: Route) -> RouteKey:
+        sender, receiver = route.sender_and_receiver(self.source, self.target)
+        return RouteKey(sender, route.read_topic, receiver, route.written_topic)
+
+    def route_of(self, key: RouteKey) -> Route | None:  # the routes must be sorted
+        named = filter(None, map(self.route, dict.fromkeys((key.topic, key.target))))
+        return next((route for route in named if self.key_of(route) == key), None)
+
     def needs(self, node: str) -> bool:
         return node in (self.source, self.target, self.broker)
 
@@ -220,24 +249,9 @@ class Connection:
         topics, broker = (*self.topics, *more.topics), more.broker or self.broker
         return replace(more, topics=topics, broker=broker)
 
-    def matches_listed(self, listed: object) -> bool:
-        return (  # what the shutdown leaves out matches any value
-            isinstance(listed, Connection)
-            and listed.source in ("", self.source)
-            and listed.target in ("", self.target)
-            and listed.type in (None, self.type)
-        )
-
     def topic_keys(self) -> Iterator[TopicKey]:
         for route in self.topics:
             yield (route.source,)
-
-    def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield (words, keys of this connection) for each topic that a shutdown lists."""
-        assert isinstance(listed, Connection)  # noqa: S101 - see matches_listed
-        carried = {*self.topic_keys()}
-        for key in listed.topic_keys():
-            yield f"topic {key[0]}", [key] if key in carried else []
 
     def without_topics(self, gone: Container[TopicKey]) -> Connection | None:
         left = tuple(route for route in self.topics if (route.source,) not in gone)
@@ -252,9 +266,10 @@ class Connection:
         if self.broker:
             yield ("broker", self.broker)
         for route in self.topics:
-            sender, taking = route.sender_and_receiver(self.source, self.target)
-            yield ("brings", taking, route.written_topic)
-            yield ("from", sender)
+            key = self.key_of(route)
+            yield ("route", *key)
+            yield ("brings", key.receiver, key.target)
+            yield ("from", key.sender)
 
 
 # ---- the interface of a connection type, and of the clients that it plans ----
@@ -372,6 +387,10 @@ class Connections(Protocol):
         """Return the ids of the connections that end at a node, sorted."""
 
 
+# How many characters the topics may have in the id of a derived connection
+_LONGEST_TOPICS = 120
+
+
 class ConnectionType(ABC):
     """How clients carry a connection. Each subclass has one instance."""
 
@@ -392,6 +411,8 @@ class ConnectionType(ABC):
     speaks_dds: ClassVar[bool] = True
     # Whether the clients must know the message type of each topic
     needs_types: ClassVar[bool] = False
+    # Whether a client restarts with each new route, so that a derived connection has only one
+    one_derived_route: ClassVar[bool] = False
 
     def __repr__(self) -> str:
         return self.name
@@ -421,9 +442,19 @@ class ConnectionType(ABC):
         # generator checks it only after this call
         return connection, ""
 
-    def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return (field of a policy's rule, value that it must allow), besides the nodes."""
-        return []
+    def broker_node(self, connection: Connection, config: Config) -> str:
+        # the node of the broker at which the clients will meet, if they need one
+        return ""
+
+    def derived_id(self, key: RouteKey) -> str:
+        """Return the id of the derived connection that carries a route."""
+        ends = f"derived/{key.sender}/{key.receiver}"
+        if not self.one_derived_route:
+            return ends
+        topics = key.topic if key.topic == key.target else f"{key.topic}:{key.target}"
+        if len(topics) > _LONGEST_TOPICS:
+            topics = f"/{naming.hash_of(topics, 20)}"
+        return ends + topics
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
         # by default, each end has a client

@@ -83,9 +83,7 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
         message += config.place_of(IMAGES_FILE)
         yield fault("type", message, code=UNSUPPORTED)
     if connection.broker and not kind.takes_broker:
-        able = listed(other for other in CONNECTION_TYPES if other.takes_broker)
-        message = f"a broker is for {able} only, but the type is {kind.name}; leave the broker out"
-        yield fault("broker", message)
+        yield broker_fault("broker", kind)
     if kind.speaks_dds and {*ends.values()} <= config.nodes.keys():
         for end, node in ends.items():
             if config.nodes[node].ros.rmw == "rmw_zenoh_cpp":
@@ -97,6 +95,12 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
                 yield fault(end, message, code=UNSUPPORTED)
     yield from kind.link_faults(connection, config)
     yield from route_faults(kind, connection.topics, (connection.source, connection.target), config)
+
+
+def broker_fault(field: str, kind: ConnectionType) -> Fault:
+    able = listed(other for other in CONNECTION_TYPES if other.takes_broker)
+    message = f"a broker is for {able} only, but the type is {kind.name}; leave the broker out"
+    return fault(field, message)
 
 
 def route_faults(

@@ -37,6 +37,7 @@ class Mqtt(ConnectionType):
     renames = True
     takes_broker = True
     speaks_dds = False
+    one_derived_route = True
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
         if config.brokers and reader.is_missing(configs.IMAGES_FILE, self.image):
@@ -49,6 +50,8 @@ class Mqtt(ConnectionType):
         if choose_broker(connection, config) is not None:
             return
         remedy = f"name one of: {', '.join(sorted(config.brokers))}"
+        place = config.place_of(configs.DOMAINS_FILE)
+        remedy += f", or ask for a 'broker' of the access domain in {place}"
         if not config.brokers:
             remedy = f"add one to {config.place_of(configs.BROKERS_FILE)}"
         ends = f"'{connection.target}' or '{connection.source}'"
@@ -81,9 +84,9 @@ class Mqtt(ConnectionType):
         )
         return replace(connection, broker=broker.node), note
 
-    def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
+    def broker_node(self, connection: Connection, config: Config) -> str:
         broker = choose_broker(connection, config)
-        return [("brokers", broker.node)] if broker else []
+        return broker.node if broker else ""
 
     def names(self, key: ClientKey) -> Iterator[tuple[str, str]]:
         yield from ConnectionType.names(self, key)
@@ -118,7 +121,10 @@ def choose_broker(connection: Connection, config: Config) -> Broker | None:
     # as the reference chooses: the only broker, or else the named one, then that of an end
     if len(config.brokers) == 1:
         return next(iter(config.brokers.values()))
-    for node in map(config.host_of, (connection.broker, connection.target, connection.source)):
+    ends = (connection.target, connection.source)
+    domains = (domain for end in ends if (domain := config.domain_of.get(end)))
+    defaults = (domain.broker or "" for domain in domains)
+    for node in map(config.host_of, (connection.broker, *ends, *defaults)):
         if node in config.brokers:
             return config.brokers[node]
     return None

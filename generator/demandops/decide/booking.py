@@ -9,7 +9,7 @@ from datetime import datetime
 from demandops.base.errors import Fault, Refused, fault, suggestion
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections import connection as routes
-from demandops.connections.connection import Connection
+from demandops.connections.connection import Connection, Route
 from demandops.decide.rollback import Restoration, restore
 from demandops.model.demand.demand import (
     Application,
@@ -70,23 +70,23 @@ def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fa
                 yield item.fault(name, message, code="conflict")
                 return
         return
+    told = set[str]()  # a contradiction with several claims is told once
     for claim in ledger.connection_claims(held.id):
         for name, new, current in (
-            ("type", str(held.type), str(claim.connection.type)),
             ("source", held.source, claim.connection.source),
             ("target", held.target, claim.connection.target),
-            ("broker", held.broker, claim.connection.broker),
         ):
-            # a broker that only one of the two names is no contradiction
-            if new == current or (name == "broker" and not (new and current)):
-                continue
-            message = (
-                f"'{new}' {_contradicts(above)}: {_held(claim, above)} with {name} '{current}'; "
-                f"use the same {name}, or another connection id"
-            )
-            yield item.fault(name, message, code="conflict")
-            return
-        yield from _route_conflicts(item, held, claim, above)
+            if new != current:
+                message = (
+                    f"'{new}' {_contradicts(above)}: {_held(claim, above)} with {name} "
+                    f"'{current}'; use the same {name}, or another connection id"
+                )
+                yield item.fault(name, message, code="conflict")
+                return
+        for each in _route_conflicts(item, held, claim, above):
+            if each.field not in told:
+                told.add(each.field)
+                yield each
 
 
 def _contradicts(above: bool) -> str:
@@ -125,7 +125,7 @@ def _route_conflicts(
         for name, old, new in routes.contradictions(current, route):
             message = (
                 f"{name} {new} of '{route.source}' {_contradicts(above)}: {held} with "
-                f"{name} {old}; use the same {name}, or a second connection"
+                f"{name} {old}; use the same {name}"
             )
             yield item.fault(f"{where}.{name}", message, code="conflict")
 
@@ -206,6 +206,11 @@ def put(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes
         key = ClaimKey(item.held.subject, demand)
         if ledger.get(key) is not None:
             message = f"'{key.subject.id}' is listed twice; list it once, with all its topics"
+            if isinstance(item.held, Connection):
+                message = (
+                    f"'{key.subject.id}' is listed between several nodes, or carries another topic "
+                    "of this demand between others; use a second connection id"
+                )
             faults.append(item.fault("id", message))
         ledger = book(ledger, item, request.id, key, start.get(key), now)
         keys.append(key)
@@ -225,19 +230,19 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
     taken, not_held = dict[ClaimKey, set[TopicKey]](), list[str]()
     for item in request.demanded:
         subject, who = item.held.subject, ", ".join(sorted(set(item.requesters)))
-        claim = ledger.get(ClaimKey(subject, demand_id(request.id, item.requesters)))
-        if claim and not (claim.joined and claim.held.matches_listed(item.held)):
-            claim = None
-        if claim is None:
-            not_held.append(f"{subject} for {who}")
-            continue
-        listed = list(claim.held.listed_topics(item.held))
-        topics = {key for _, keys in listed for key in keys}
-        if not listed:
-            topics = {*claim.held.topic_keys()}
-        if topics:
-            taken.setdefault(claim.key, set()).update(topics)
-        not_held += [f"{subject}: {words} for {who}" for words, keys in listed if not keys]
+        mine = [
+            claim
+            for claim in ledger.claims_of_demand(demand_id(request.id, item.requesters))
+            if claim.joined
+        ]
+        listing = _listed_inputs if isinstance(item.held, Application) else _listed_routes
+        for words, held in listing(item.held, mine):  # type: ignore[arg-type]
+            for key, topics in held:
+                taken.setdefault(key, set()).update(topics)
+            if not held:
+                not_held.append(
+                    f"{subject}: {words} for {who}" if words else f"{subject} for {who}"
+                )
     if not taken:
         similar = [
             f"{claim.subject} for {', '.join(claim.requesters)} ("
@@ -266,6 +271,58 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
         after = after.replace(key, claim and claim.without_topics(topics))
     changes = claim_changes(ledger, after, taken)
     return after, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
+
+
+# (words, claims and their topics) for each topic that a shutdown lists; no words: for the subject
+_Listed = Iterator[tuple[str, list[tuple[ClaimKey, set[TopicKey]]]]]
+
+
+def _listed_inputs(listed: Application, claims: list[Claim]) -> _Listed:
+    claim = next((claim for claim in claims if claim.subject == listed.subject), None)
+    app = claim.application if claim else listed
+    if claim is None or listed.node not in ("", app.node) or listed.appdef != app.appdef:
+        yield "", []
+    elif any(listed.inputs.values()):
+        for words, keys in app.listed_topics(listed):
+            yield words, [(claim.key, set(keys))] if keys else []
+    else:
+        yield "", [(claim.key, set(app.topic_keys()))]
+
+
+def _listed_routes(listed: Connection, claims: list[Claim]) -> _Listed:
+    """Find the routes wherever the demand has them; a node that is left out matches any node."""
+    nodes = {*filter(None, listed.nodes)}
+    claims = [c for c in claims if not c.is_on_application and nodes <= {*c.connection.nodes}]
+    if not listed.topics:
+        listing = {
+            claim.key: {
+                (route.source,)
+                for route in claim.connection.topics
+                if not route.implied and (route.listed or claim.subject.id) == listed.id
+            }
+            for claim in claims
+        }
+        yield "", [(key, set[TopicKey](topics)) for key, topics in listing.items() if topics]
+        return
+    held = [(route, list(_keys_of(route, listed, claims))) for route in listed.topics]
+    if not any(keys for _, keys in held) and not any(c.subject == listed.subject for c in claims):
+        yield "", []
+        return
+    for route, keys in held:
+        yield f"topic {route.source}", keys
+
+
+def _keys_of(
+    route: Route, listed: Connection, claims: list[Claim]
+) -> Iterator[tuple[ClaimKey, set[TopicKey]]]:
+    for claim in claims:
+        named = (route.read_topic, route.written_topic)
+        booked = claim.connection.route(route.source) if claim.subject == listed.subject else None
+        for other in filter(None, map(claim.connection.route, dict.fromkeys(named))):
+            if booked is None and (other.read_topic, other.written_topic) == named:
+                booked = other
+        if booked:
+            yield claim.key, {(booked.source,)}
 
 
 def release_demand(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:

@@ -27,7 +27,7 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Changes, Ledger, World
 from demandops.model.release import Release, ServiceRelease
-from demandops.render import manifests, release_file
+from demandops.render import gitops
 from demandops.render.gitops import path_of
 from demandops.templating.values import Evaluate
 
@@ -180,7 +180,7 @@ def render_all(
     With ``keeps_late``, a release whose values take too long to compute keeps its file.
     """
     config, keys = world.config, all_keys(world)
-    files = manifests.base_files(config)
+    files = gitops.base_files(config)
     texts = _Texts(config, evaluate)
     collisions.refuse_shared_names(world, keys)  # one would overwrite the file of the other
     for key in keys:
@@ -195,7 +195,7 @@ def render_all(
                 raise
             if path in current:
                 files[path] = current[path]
-    return files | release_file.kept_charts(files, current, world)
+    return files | gitops.kept_charts(files, current, world)
 
 
 class _Texts:
@@ -213,7 +213,7 @@ class _Texts:
         if template in self._late:
             raise self._late[template]
         try:
-            return release_file.release_text(release, self._config, self._evaluate, current)
+            return gitops.release_text(release, self._config, self._evaluate, current)
         except OverLimit as error:
             self._late[template] = error
             raise
@@ -360,7 +360,7 @@ def _render_errors(
         if config.values_template(release.service) in late:
             continue
         try:
-            manifests.render(release, config, evaluate)
+            gitops.render(release, config, evaluate)
         except InvalidInput as error:
             errors.append(error)
             if isinstance(error, OverLimit):
@@ -432,7 +432,7 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
         try:
             release = plan(world, key)
             if release is not None:
-                manifests.render(release, world.config, evaluate)
+                gitops.render(release, world.config, evaluate)
         except InvalidInput as error:
             errors.append((key, error))
     if not errors:

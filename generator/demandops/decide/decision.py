@@ -17,7 +17,7 @@ from typing import Literal, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.base.naming import Subject
-from demandops.decide import changeset, rollback, warnings
+from demandops.decide import carriers, changeset, rollback, warnings
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.completing import (
     completed,
@@ -31,9 +31,8 @@ from demandops.decide.changeset import Changeset, FileReader, ReleaseChange
 from demandops.decide.checks import collisions, quotas, version_difference
 from demandops.decide.placement import capacity, placement, relocation
 from demandops.decide.placement.candidates import NO_ROOM
-from demandops.decide.planning.flows import flows, without_idle_deliveries
+from demandops.decide.planning.flows import flows_without_carrier
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
-from demandops.decide.planning.planner import is_bridged
 from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, keys_of_claims
 from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
@@ -323,7 +322,8 @@ class _Trials:
                 "too many nodes would have to be tried for this demand; name a node for each "
                 "application, or split the demand"
             )
-        request, config = placed(request, self._state), self._state.config
+        config = self._state.config
+        request = placed(request, self._state, self._checkpoint)
         if next(admission.faults(request, config), None):
             return False
         for item in _paced(request.demanded, self._checkpoint):
@@ -349,6 +349,9 @@ def _carried_out(
     if isinstance(request, Drain):
         request = relocation.with_moves(request, state, state.usage(), state.names(), MOST_TRIALS)
     if isinstance(request, Restoration):
+        # claims of before the upgrade may carry a route twice
+        united, _ = carriers.with_one_carrier(ledgers.ledger_of(request.claims))
+        request = replace(request, claims=tuple(united))
         request = relocation.with_restored_moves(request, state)
         faults = list(rollback.faults(request, state))
         if faults:
@@ -428,10 +431,10 @@ def _booked(
     for subject in subjects:
         ledger = ledger.without(ledger.kept_claims(subject))
     ledger, changes = apply(ledger, request, now)
-    if isinstance(request, Decommission):
-        ledger, changes = without_idle_deliveries(
-            state.ledger, replace(state, ledger=ledger), changes
-        )
+    if not isinstance(request, Restoration):
+        ledger, idle = carriers.without_idle_routes(ledger, state.config, changes.claims)
+        idle += [change.key for change in changes.claims]
+        changes = replace(changes, claims=ledgers.claim_changes(state.ledger, ledger, idle))
     after = replace(state, ledger=ledger)
     checkpoint()
     refusals = list(quotas.denial_faults(request, after, changes))
@@ -470,24 +473,19 @@ def notes_on(
     # a connection that an override denies carries nothing
     ledger = without_suspended(after).ledger
     for item in request.demanded if request.adds_claims else ():
-        held = item.held
-        if isinstance(held, Application):
-            for flow in flows(after.config, held):
-                if not ledger.is_carried_to(flow.receiver, flow.target):
-                    yield (
-                        f"application '{held.id}': no connection carries {flow.topic} "
-                        f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
-                    )
-            continue
-        if item.note:
-            yield f"connection '{held.id}' {item.note}"
-        for route in held.topics:
-            if is_bridged(route, *held.nodes, after.config):
+        if isinstance(item.held, Application):
+            for flow in flows_without_carrier(after.config, item.held, ledger):
                 yield (
-                    f"connection '{held.id}': the initial deployment already carries "
-                    f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
-                    "the inventory), so no client of this connection carries it"
+                    f"application '{item.held.id}': no connection carries {flow.topic} "
+                    f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
                 )
+    yield from request.notes
+    for change in changes.claims:
+        if change.after and not change.after.is_on_application:
+            former = change.before.connection.topics if change.before else ()
+            for index, words in carriers.brought_twice(change.after.connection, ledger):
+                if change.after.connection.topics[index] not in former:
+                    yield f"{words}; a subscriber gets the messages of both"
     yield from warnings.notes(request, before)
     yield from warnings.unheld_output_notes(request, after)
     yield from warnings.lost_output_notes(changes, after)

@@ -17,7 +17,7 @@ from demandops.decide.checks.collisions import all_names, publishers
 from demandops.decide.placement.candidates import lacks, requirement_of, unmet
 from demandops.decide.placement.capacity import overcommitted, whole_usage
 from demandops.decide.placement.relocation import following_overrides, with_moves
-from demandops.decide.planning.flows import flows, topics_of_origin
+from demandops.decide.planning.flows import flows_without_carrier, topics_of_origin
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.release_keys import claims_needing
 from demandops.model.config.appdef import ignored_fields
@@ -70,14 +70,8 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
         elif topic.application and not any(publishers(active, topic.source, topic.topic)):
             maker = f"application '{topic.application}' of '{topic.source}'"
             yield f"{role} {topic.topic} does not arrive: {maker} does not make it"
-    for flow in flows(config, app):
-        sender = config.nodes.get(flow.sender)
-        carried = active.ledger.is_carried_to(flow.receiver, flow.target)
-        if sender is None or carried:
-            continue
-        # The initial deployment keeps topic names, so it carries no flow that renames a topic.
-        bridged = sender.bridged.get(flow.receiver, ())
-        if flow.topic != flow.target or flow.topic not in bridged:
+    for flow in flows_without_carrier(config, app, active.ledger):
+        if flow.sender in config.nodes:
             yield (
                 f"{flow.name} {flow.topic} does not arrive: no connection carries it from "
                 f"'{flow.sender}' to '{flow.receiver}'"

@@ -49,6 +49,9 @@ class ConnectionEntry:
     target: str
     topics: _Requesters
     requesters: list[str]
+    # by topic, where they differ: its name at the target, and the ids that demands list it under
+    targets: dict[str, str]
+    listed: dict[str, list[str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,16 +131,22 @@ def bookkeeping(world: World) -> Bookkeeping:
         first, claims = active.ledger.connection(id), active.ledger.connection_claims(id)
         if first is None or not claims:
             continue
-        requesters = {route.source: set[str]() for route in connection_topics(claims)}
+        routes = connection_topics(claims)
+        requesters = {route.source: set[str]() for route in routes}
+        listed: dict[str, set[str]] = {}
         for claim in claims:
             for route in claim.connection.topics:
                 requesters[route.source].update(claim.requesters)
+                if route.listed:
+                    listed.setdefault(route.source, set()).add(route.listed)
         connections[id] = ConnectionEntry(
             type=first.type.word if first.type else "",
             source=first.source,
             target=first.target,
             topics=_sorted(requesters),
             requesters=list(requesters_of(claims)),
+            targets={r.source: r.target for r in routes if r.source != r.target},
+            listed=_sorted(dict(sorted(listed.items()))),
         )
     suspended = [
         SuspendedEntry(
@@ -203,11 +212,26 @@ def _sorted(topics: dict[str, set[str]]) -> _Requesters:
     return {topic: sorted(who) for topic, who in topics.items()}
 
 
+def carried_topics(entry: Mapping[str, Any]) -> _Requesters:
+    """Return the requesters of each topic of a connection, in words such as ``/raw as /points``."""
+    targets, listed = entry.get("targets", {}), entry.get("listed", {})
+    return {
+        topic
+        + (f" as {targets[topic]}" if topic in targets else "")
+        + (f" of {', '.join(listed[topic])}" if topic in listed else ""): who
+        for topic, who in entry["topics"].items()
+    }
+
+
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
     data = asdict(view) | {"commit": commit}
     for entry in data["demands"].values():
         if not entry["held_for"]:
             del entry["held_for"]
+    for entry in data["connections"].values():
+        for name in ("targets", "listed"):
+            if not entry[name]:
+                del entry[name]
     return {name: part for name, part in data.items() if part or name not in _LEFT_OUT}
 
 
@@ -269,7 +293,10 @@ def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
 
 
 def _topics(entry: _Entry) -> _Requesters:
-    inputs = {"topic": entry.topics} if isinstance(entry, ConnectionEntry) else entry.inputs
+    if isinstance(entry, ConnectionEntry):
+        inputs = {"topic": carried_topics(asdict(entry))}
+    else:
+        inputs = entry.inputs
     return {
         f"{role} {topic}": requesters
         for role, topics in inputs.items()

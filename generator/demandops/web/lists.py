@@ -312,7 +312,13 @@ class ConnectionsList(ListKind):
                 "by": cell(held.type.word if held.type else ""),
                 "from": _linked("connections", "from", [held.source]),
                 "to": _linked("connections", "to", [held.target]),
-                "topic": cell(*(route.source for route in connection_topics(claims))),
+                "topic": cell(
+                    *(
+                        route.source if same else f"{route.source} as {route.target}"
+                        for route in connection_topics(claims)
+                        for same in [route.source == route.target]
+                    )
+                ),
                 "requester": _requesters(requesters_of(claims)),
                 "release": cell(*map(_release_part, clients)),
                 "health": _health_cell(word),

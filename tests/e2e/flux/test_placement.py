@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import yaml
+from demandops.base.naming import object_name
 from demandops_ros import DemandClient
 
 from tests.e2e.common.expected import WITHOUT_DEMANDS
@@ -73,10 +74,11 @@ def application(id: str, vehicle: str) -> dict[str, Any]:
 
 
 def fused(id: str, vehicle: str, node: str, *, delivered: bool = False) -> Pods:
-    ways = [(vehicle, node), *([(node, vehicle)] if delivered else [])]
+    ways = [(vehicle, node, f"/vehicles/{vehicle}/ego_data")]
+    ways += [(node, vehicle, f"/{id}_global_objectlist")] if delivered else []
     clients = {
-        (f"mqtt-derived-{source}-{target}-{side}", end)
-        for source, target in ways
+        (object_name("mqtt", f"derived/{source}/{target}{topic}", side), end)
+        for source, target, topic in ways
         for side, end in (("source", source), ("target", target))
     }
     return {(f"of-{id}", node), *clients}

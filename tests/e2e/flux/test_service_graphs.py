@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import yaml
+from demandops.base.naming import object_name
 from demandops_ros import DemandClient
 
 from tests.e2e.common.expected import WITHOUT_DEMANDS
@@ -117,11 +118,15 @@ def assert_exact(domain: Namespace, *vehicles: str) -> None:
     flows = []
     for vehicle in vehicles:
         pods |= {(f"lidar-{vehicle}-{vehicle}", vehicle), (f"od-edge-{vehicle}", "edge")}
-        for ends in ((vehicle, "edge"), ("edge", vehicle)):
-            client = f"mqtt-derived-{'-'.join(ends)}"
-            pods |= {(f"{client}-source", ends[0]), (f"{client}-target", ends[1])}
-        flows += [(vehicle, topic, "edge") for topic in (f"/{vehicle}_points", ego_data(vehicle))]
-        flows.append(("edge", PLAN, vehicle))
+        here = [(vehicle, topic, "edge") for topic in (f"/{vehicle}_points", ego_data(vehicle))]
+        here.append(("edge", PLAN, vehicle))
+        for source, topic, target in here:
+            id = f"derived/{source}/{target}{topic}"
+            pods |= {
+                (object_name("mqtt", id, side), end)
+                for side, end in (("source", source), ("target", target))
+            }
+        flows += here
     wait_for_pods({domain: pods})
     domain.wait_releases()
     assert domain.pods() == pods, "the namespace changed again"

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.base.naming import object_name
 from demandops_ros import DemandClient
 
 from tests.e2e.common.expected import CLUSTER, NAMESPACE, WITHOUT_DEMANDS
@@ -29,15 +30,15 @@ CLOUD = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 FLEETS = {
     ("od-edge-vehicle00", "edge"),
     ("of-edge-fleet", "edge"),
-    ("mqtt-derived-vehicle00-edge-source", "vehicle00"),
-    ("mqtt-derived-vehicle00-edge-target", "edge"),
+    (object_name("mqtt", f"derived/vehicle00/edge{CLOUD}", "source"), "vehicle00"),
+    (object_name("mqtt", f"derived/vehicle00/edge{CLOUD}", "target"), "edge"),
 }
-TO_THE_CITY = {("mqtt-derived-vehicle00-edge-city-source", "vehicle00")}
+TO_THE_CITY = {(object_name("mqtt", f"derived/vehicle00/edge@city{CLOUD}", "source"), "vehicle00")}
 """The source end of the connection to the city; it runs in the access domain of the vehicle."""
 CITYS = {
     ("od-edge-city-vehicle00", "edge"),
     ("of-edge-lights", "edge"),
-    ("mqtt-derived-vehicle00-edge-city-target", "edge"),
+    (object_name("mqtt", f"derived/vehicle00/edge@city{CLOUD}", "target"), "edge"),
 }
 
 

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 from demandops.base import settings
 from demandops.model.ledger.claim import Claim
-from demandops.repo.write.journal import JournalEntry, Slot
+from demandops.repo.write.journal import Slot
+from demandops.serve.agenda import LIMIT_LOCAL
 from demandops.serve.generator import Generator
-from demandops.serve.timing.pauses_and_limits import LIMIT_LOCAL
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock
@@ -77,18 +77,18 @@ def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(
         wait_until_gone(generator, "short")
         assert held(generator, "stays")
     (commit,) = expiries(bare)
-    assert commit.summary == "Expire edge/short, derived/vehicle00/edge"
+    assert commit.summary == "Expire edge/short, derived/vehicle00/edge/ego"
     assert commit.all("Demand-Id") == ["short"]
     assert commit.all("Requester") == ["station00", "vehicle00"]
     assert commit.all("Application") == ["edge/short"]
-    assert commit.all("Connection") == ["derived/vehicle00/edge"]
+    assert commit.all("Connection") == ["derived/vehicle00/edge/ego"]
     assert len(commit.all("Operation-Id")) == 1
     form = "--format=%an <%ae>%n%ct%n%b"
     author, made, body = rig.git(bare, "log", "-1", form, commit.id).split("\n", 2)
     assert author == "station00, vehicle00 (requesters) <short@requester.demandops.invalid>"
     assert int(made) >= int(end.timestamp()), "the lease was ended too early"
     assert f"ended at {end:%Y-%m-%d %H:%M:%S} UTC" in body.replace("\n", " ")
-    assert list(rig.books(bare)["connections"]) == ["derived/vehicle00/edge"]
+    assert list(rig.books(bare)["connections"]) == ["derived/vehicle00/edge/ego"]
     rig.assert_sound(bare)
 
 
@@ -103,7 +103,7 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
     # so many others before it that it is not in the first batch
     others = {f"op-{number}": renew("nothing") for number in range(LIMIT_LOCAL)}
     for operation, goal in (others | {"op-renew": renew("d")}).items():
-        slot.journal.append([JournalEntry(operation, goal, received, rig.tip(bare))])
+        slot.journal.append([rig.journaled(operation, goal, received, rig.tip(bare))])
     slot.close()
     clock.pass_(100)
     with rig.running(bare, runtime=clock) as generator:

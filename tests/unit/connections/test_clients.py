@@ -87,8 +87,9 @@ def test_both_nodes_of_a_connection_are_affected_and_no_other() -> None:
 def test_no_two_connections_share_an_mqtt_topic_or_a_client_id() -> None:
     repo = MemoryRepo()
     ids = ("c", "c/d", "c_d", "C", "c-source", "c/source", "+", "#", "$SYS/x", "a/+/b", "/", "//")
-    for id in ids:
-        repo.send(goal([], [connection(id, topics=["/d", "/c/d"])], id=id))
+    for number, id in enumerate(ids):
+        targets = [f"/d{number}", f"/c/d{number}"]
+        repo.send(goal([], [connection(id, topics=["/d", "/c/d"], targets=targets)], id=id))
     topics = []
     for name, whole in configurations(repo).items():
         parameters = whole["/**/*"]["ros__parameters"]

@@ -64,7 +64,8 @@ REFUSED: dict[str, tuple[State, dict[str, Any]]] = {
     "no message type of what is carried back": (_ROS, demand("ros", {"/a": {"reverse": True}})),
     "durability without reliability": (_ROS, demand("ros", {"/a": {"durability": "volatile"}})),
     "two connections on one port": (
-        decided(state(vehicle00=TYPED, edge=_NARROW), demand("ros")), demand("ros", id="d"),
+        decided(state(vehicle00=TYPED, edge=_NARROW), demand("ros")),
+        demand("ros", {"/b": {"type": "std_msgs/msg/String"}}, id="d"),
     ),
 }  # fmt: skip
 

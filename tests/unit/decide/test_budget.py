@@ -215,7 +215,7 @@ def test_derived_connections_count_before_they_are_booked() -> None:
 
 
 def test_a_claim_that_is_too_large_for_its_file_is_refused_before_a_release_is_planned() -> None:
-    some, more = demand([app(0, 400, node="edge")]), demand([app(0, 800, node="edge")])
+    some, more = demand([], [link(0, topics=400)]), demand([], [link(0, topics=800)])
     limited = repo(fileBytes=20_000)
     some_calls, _, answer = work_of(limited, some)
     assert codes(answer) == {"too-large"}

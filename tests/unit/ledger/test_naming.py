@@ -143,7 +143,10 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
     placed = {id_: nodes[place % len(nodes)] for place, id_ in enumerate(applications)}
     apps = [application(id_, node=node, clouds=asked) for id_, node in placed.items()]
     ends = nodes[0], nodes[1]
-    links = [connection(id_, ends=ends, topics=["/a"], targets=["/b"]) for id_ in connections]
+    links = [
+        connection(id_, ends=ends, topics=["/a"], targets=[f"/b{number}"])
+        for number, id_ in enumerate(connections)
+    ]
     (request,) = told([goal(apps, links)])
 
     taken = repo.take(request)
@@ -154,7 +157,15 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
         assert len({*map(as_the_reference, ids_of_topics)}) < len(ids_of_topics), taken
         return
     places = {*placed.values()}
+    brokers = repo.config.brokers.keys()
+    derived = {
+        (place, *topic)
+        for place in places
+        for topic in asked
+        if topic[1] != place and {topic[1], place} & brokers
+    }
     releases = len(places) * len(asked) + len(applications) + 2 * len(connections)
+    releases += 2 * len(derived)
     assert len(taken.releases) == len({release.name for release in taken.releases}) == releases
     manifests = [*repo.rendered().values()]
     assert len(manifests) == releases

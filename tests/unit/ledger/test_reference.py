@@ -57,7 +57,10 @@ def counted(ledger: Ledger) -> Books:
     books = defaultdict[str, list[str]](list)
     for claim in ledger:
         if not claim.is_on_application:
-            books[resource("mqtt-connection", claim.subject.id)] += claim.requesters
+            # the reference derives no connection, and knows a topic by the id that lists it
+            topics = (topic for topic in claim.connection.topics if not topic.implied)
+            for id in {topic.listed or claim.subject.id for topic in topics}:
+                books[resource("mqtt-connection", id)] += claim.requesters
             continue
         fusion = resource("of", claim.subject.id)
         for key in claim.held.topic_keys():
@@ -84,7 +87,10 @@ def running(repo: MemoryRepo) -> Books:
         else:
             runs[resource("od", service["node"], service["source"])] |= topics
     for id, entry in books["connections"].items():
-        runs[resource("mqtt-connection", id)] |= {*entry["topics"]}
+        for topic in entry["topics"]:
+            for listed in entry.get("listed", {}).get(topic, [id]):
+                if not listed.startswith("derived/"):  # the reference has none
+                    runs[resource("mqtt-connection", listed)].add(topic)
     return {name: sorted(topics) for name, topics in runs.items()}
 
 

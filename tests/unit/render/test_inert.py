@@ -115,7 +115,8 @@ def test_ids_are_read_back_as_they_were() -> None:
     books = inventory(f"    id: {quoted(text)}\n    selector: {{a: b}}\n" for text in IDS)
     for text in IDS:
         app = application(text, who=[text], clouds=[("/a", text)])
-        books.send(goal([app], [connection(text, who=[text], ends=(text, "edge"))], id=text))
+        link = connection(text, who=[text], ends=(text, "edge"), topics=["/a"])
+        books.send(goal([app], [link], id=text))
     claimed = []
     for content in books.below("ledger").values():
         assert_unmistakable(content)

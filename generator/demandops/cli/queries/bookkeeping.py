@@ -11,7 +11,7 @@ from demandops.cli.output import at_option, progress, version_lines, warn_of
 from demandops.cli.table import Table, column, joined, table_of
 from demandops.cli.target import state_repo_option
 from demandops.repo import reader
-from demandops.views.bookkeeping import as_data
+from demandops.views.bookkeeping import as_data, carried_topics
 from demandops.views.bookkeeping import bookkeeping as derive
 
 
@@ -90,7 +90,7 @@ _CONNECTIONS = (
     column("By", "type", 3),
     column("From", "source", 1),
     column("To", "target", 1),
-    column("Topics", lambda entry: _topics(entry["topics"], entry), 4),
+    column("Topics", lambda entry: _topics(carried_topics(entry), entry), 4),
     column("Requesters", joined("requesters"), 2, wraps=True),
 )
 _SUSPENDED = (

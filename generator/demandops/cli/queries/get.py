@@ -42,7 +42,7 @@ from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.views import demand_lists, release_causes
-from demandops.views.bookkeeping import bookkeeping
+from demandops.views.bookkeeping import bookkeeping, carried_topics
 from demandops.views.release_causes import override_report, override_state
 
 # ---- the kinds of things: their data, columns and filters ----
@@ -177,7 +177,7 @@ class _Connections(Kind):
         column("To", "target", 1),
         column("Requesters", joined("requesters"), 3, wraps=True),
     )
-    wide = (column("Topics", lambda item, now: list(item["topics"])),)
+    wide = (column("Topics", lambda item, now: list(carried_topics(item))),)
     filters = _COMMON | {"node": lambda item: [item["source"], item["target"]]}
 
     def items(self, source: Source) -> list[Json]:

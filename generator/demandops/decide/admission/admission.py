@@ -20,7 +20,15 @@ from demandops.connections.connection import Connection
 from demandops.model.config.appdef import ApplicationDefinition, Services
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.repo_settings import Limits
-from demandops.model.demand.demand import LONGEST_S, AnyDemand, Application, Delivery, Demand, Item
+from demandops.model.demand.demand import (
+    LONGEST_S,
+    AnyDemand,
+    Application,
+    Connect,
+    Delivery,
+    Demand,
+    Item,
+)
 from demandops.model.demand.goals import ITEMS, too_large
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
@@ -46,7 +54,8 @@ def faults(request: Demand, config: Config) -> Iterator[Fault]:
     for index, node in enumerate(request.positions):
         yield from _id_faults(f"positions[{index}].node", node)
         yield from _node_faults(f"positions[{index}].node", node, config)
-    if not request.demanded and request.operation not in ("release", "renew"):
+    # what the initial deployment carries needs no claim, and the notes say so
+    if not request.demanded and not request.notes and request.operation not in ("release", "renew"):
         message = "the request lists no application and no connection; list at least one"
         yield fault("id" if request.is_reference else "applications", message, code="empty")
     for item in request.demanded:
@@ -101,6 +110,7 @@ def _application_faults(app: Application, config: Config, claiming: bool) -> Ite
         for position, topic in enumerate(topics)
         if not topic.application  # its faults are those of the application whose output it is
     ]
+    yield from _connect_faults(app.connect)
     # a shutdown may leave out nodes and sources, because it lists what is booked already
     if claiming or app.node:
         yield from _id_faults("node", app.node)
@@ -134,6 +144,15 @@ def _application_faults(app: Application, config: Config, claiming: bool) -> Ite
     if appdef is not None and not any(app.inputs.values()):
         roles = " or ".join(sorted(appdef.inputs))
         yield fault("inputs", f"is empty; list at least one topic of {roles}")
+
+
+def _connect_faults(connect: Connect) -> Iterator[Fault]:
+    if connect.broker:
+        yield from _id_faults("connect.broker", connect.broker)
+        if connect.type not in ("auto", "none"):
+            kind = connection_types.type_named(connect.type)
+            if not kind.takes_broker:
+                yield connection_types.broker_fault("connect.broker", kind)
 
 
 def _delivery_faults(where: str, delivery: Delivery, services: Services) -> Iterator[Fault]:
@@ -294,6 +313,8 @@ def with_chosen_types(
     if not request.adds_claims:
         return request
 
+    notes = list(request.notes)
+
     def with_type(item: Item) -> Item:
         connection = item.held
         if not isinstance(connection, Connection):
@@ -308,6 +329,9 @@ def with_chosen_types(
             return replace(item, held=connection)
         # the type may use another broker than the request names; the note says so
         connection, note = connection.type.settled(connection, config)
-        return replace(item, held=connection, note=note or item.note)
+        if note:
+            notes.append(f"connection '{connection.id}' {note}")
+        return replace(item, held=connection)
 
-    return replace(request, demanded=tuple(map(with_type, request.demanded)))
+    demanded = tuple(map(with_type, request.demanded))
+    return replace(request, demanded=demanded, notes=tuple(notes))

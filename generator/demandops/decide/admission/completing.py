@@ -7,10 +7,11 @@ from dataclasses import replace
 
 from demandops.base.errors import Fault
 from demandops.connections.connection import Connection
+from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
 from demandops.decide.placement import placement
-from demandops.decide.planning import chains, flows
+from demandops.decide.planning import chains
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.inventory import id_in_domain
@@ -44,22 +45,40 @@ def completed(
     demand, not_placed = placement.with_chosen_nodes(
         demand, state, state.usage(), trial, checkpoint
     )
-    return placed(demand, state), [*unclear, *unread, *not_placed]
+    return placed(demand, state, checkpoint), [*unclear, *unread, *not_placed]
 
 
-def placed(demand: AnyDemand, state: State) -> AnyDemand:
+def placed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -> AnyDemand:
     """Return a demand, whose nodes are chosen, with all else that the generator adds."""
     config, ledger = state.config, state.ledger
     if chains.reads_outputs(demand):
         # again, because the nodes of listed applications may have been open
         demand, _ = chains.with_topics_of_outputs(demand, ledger, config)
         demand = chains.with_held_applications(demand, ledger, config)
+    demand = carriers.with_implied_routes(demand, ledger, config)
+    checkpoint()
+    # before what depends on the connection: its lease, type, permission, quota and approval
+    demand = carriers.with_carriers(demand, ledger, config)
+    checkpoint()
     demand = permission.with_lease_terms(demand, config)
-    # clients of the reference list their connections, and later shut down just what they listed
-    if not demand.is_reference:
-        demand = flows.with_implied_connections(demand, ledger, config)
     demand = admission.with_chosen_types(demand, config, ledger.connection)
+    if demand.operation == "join":
+        demand = _without_impossible_routes(demand, config)
     return replace(demand, is_complete=True)
+
+
+def _without_impossible_routes(demand: AnyDemand, config: Config) -> AnyDemand:
+    # A client of the reference does not ask for the connections that it does not list, and gets a
+    # warning where there can be none.
+    def is_possible(item: Item) -> bool:
+        held = item.held
+        if not isinstance(held, Connection) or not all(route.implied for route in held.topics):
+            return True
+        alone = replace(demand, demanded=(item,))
+        faults = (*admission.faults(alone, config), *permission.faults(alone, config))
+        return not held.topics or not faults
+
+    return replace(demand, demanded=tuple(filter(is_possible, demand.demanded)))
 
 
 # ---- the definition that a goal of the reference's action means by a number ----

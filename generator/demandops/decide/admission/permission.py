@@ -64,7 +64,8 @@ def needed_access(
         )
     else:
         nodes, first = held.nodes, []
-        more = held.type.access(held, config) if held.type else []
+        broker = held.type.broker_node(held, config) if held.type else ""
+        more = [("brokers", broker)] if broker else []
     domains = {node: config.domain_of[node] for node in nodes if node in config.domain_of}
     for node, domain in domains.items():
         access = [*first, ("nodes", config.host_of(node)), *more]

@@ -14,14 +14,15 @@ from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections.connection import ClientKey
+from demandops.decide import carriers
 from demandops.decide.planning import release_keys
-from demandops.decide.planning.flows import flows, outputs, usual_topic
+from demandops.decide.planning.flows import outputs, usual_topic
 from demandops.decide.planning.planner import service_name
 from demandops.decide.planning.release_keys import ReleaseKey, is_needed, keys_of, keys_of_claims
 from demandops.decide.rollback import request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import NODES_FILE, Config
-from demandops.model.demand.demand import Application, Demand, Item
+from demandops.model.demand.demand import Application, Demand
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim, ClaimKey, path_of
@@ -44,11 +45,16 @@ def topic_faults(
     for key in keys:
         if isinstance(key, ServiceKey) and not is_needed(before, key):
             yield from islice(_clashes_of_service(request, after, key), 1)
+    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
+    chosen = any(app.place or {*app.services} - {*app.named} for app in apps)
     for item in request.demanded:
-        if isinstance(item.held, Application):
-            yield from _clashes_of_flows(item, item.held, after)
-            continue
         connection = item.held
+        if isinstance(connection, Application):
+            continue
+        for index, both in carriers.chosen_twice(connection, apps, after.ledger) if chosen else ():
+            if not before.ledger.route_holders(connection.key_of(connection.topics[index])):
+                message = f"{both}; choose another node"
+                yield item.fault(f"topics[{index}]", message, code="conflict")
         for index, route in enumerate(connection.topics):
             _, node = route.sender_and_receiver(*connection.nodes)
             topic = route.written_topic
@@ -71,6 +77,14 @@ def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault
     keys = keys_of_claims(after, [claim])
     for clash in topic_faults(request_for(claim), before, after, keys):
         yield clash.within(path_of(claim.key))
+    for index, other in (
+        () if claim.is_on_application else carriers.doubled(claim.connection, after.ledger)
+    ):
+        message = (
+            f"connection '{other}' carries this topic between the same nodes already; remove it "
+            "from one of the two"
+        )
+        yield fault(f"topics[{index}]", message, code="conflict").within(path_of(claim.key))
 
 
 def _clashes_of_service(request: Demand, after: World, key: ServiceKey) -> Iterator[Fault]:
@@ -98,38 +112,6 @@ def _clashes_of_service(request: Demand, after: World, key: ServiceKey) -> Itera
                 f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}"
             )
             yield fault(_field(request, key, service), message, code="conflict")
-
-
-def _clashes_of_flows(item: Item, app: Application, after: World) -> Iterator[Fault]:
-    has_outputs_elsewhere = app.deliver or app.services or app.moved
-    for flow in flows(after.config, app) if has_outputs_elsewhere else ():
-        # Of an input that the demand lists, the demand names the source, so it is no fault.
-        if flow.delivery is None and not flow.is_output:
-            continue
-        for id in after.ledger.connections_bringing(flow.receiver, flow.target):
-            other = after.ledger.connection(id)
-            elsewhere = other is not None and {*other.nodes} != {flow.sender, flow.receiver}
-            brought = f"{flow.target} already comes to '{flow.receiver}' by connection '{id}'"
-            if elsewhere and flow.delivery is None:
-                message = (
-                    f"{brought}, and would also come from '{flow.sender}'; choose another node for "
-                    "the service that reads this topic"
-                )
-                yield item.fault("id", message, code="conflict")
-            elif elsewhere:
-                place, message = f"deliver[{flow.delivery}].output", "leave this delivery out"
-                yield item.fault(place, f"{brought}; {message}", code="conflict")
-            if elsewhere or flow.delivery is None:
-                continue
-            claims = after.ledger.connection_claims(id)
-            routes = (route for claim in claims for route in claim.connection.topics)
-            read = {route.read_topic for route in routes if route.written_topic == flow.target}
-            for topic in sorted(read - {flow.topic})[:1]:
-                message = (
-                    f"connection '{id}' already brings {topic} to '{flow.receiver}' as "
-                    f"{flow.target}; choose another topic for this delivery"
-                )
-                yield item.fault(f"deliver[{flow.delivery}].topic", message, code="conflict")
 
 
 def publishers(

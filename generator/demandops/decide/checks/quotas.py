@@ -8,6 +8,7 @@ from itertools import islice
 
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import Subject, SubjectKind
+from demandops.connections.connection import Connection
 from demandops.decide.planning import overrides
 from demandops.decide.planning.overrides import Traits, fits
 from demandops.decide.planning.release_keys import is_needed, keys_of, keys_of_claims
@@ -51,9 +52,15 @@ def denial_faults(request: Demand, after: World, changes: Changes) -> Iterator[F
         )
         for override, selector in islice(matching, 1):
             until = f" until {format_time(override.end)}" if override.end else ""
+            carried = ""
+            if isinstance(item.held, Connection) and not item.is_listed:
+                route = item.held.topics[0]
+                what = f" of connection '{route.listed}'" if route.listed else ""
+                topic = item.held.key_of(route).topic
+                carried = f"{topic}{what} is carried by connection '{item.held.id}', which "
             message = (
-                f"is denied by {override.path}{until}: {override.reason}; ask the override's "
-                f"owner, {override.owner}, or demand something else"
+                f"{carried}is denied by {override.path}{until}: {override.reason}; ask the "
+                f"override's owner, {override.owner}, or demand something else"
             )
             yield item.fault(_matched_field(selector, item, after.config), message, code="denied")
 

@@ -12,7 +12,7 @@ from math import inf
 from demandops.base.errors import Fault, sentences
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
-from demandops.connections.connection import Connection, Route
+from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
 from demandops.decide.booking import Drain, conflicts
 from demandops.decide.checks import collisions, quotas
@@ -21,7 +21,7 @@ from demandops.decide.placement import candidates
 from demandops.decide.placement.candidates import Choice, Chosen
 from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning import chains, overrides
-from demandops.decide.planning.flows import Flow, connection_for, flows
+from demandops.decide.planning.flows import flows
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.rollback import Restoration, request_for
 from demandops.model.config.appdef import Service
@@ -30,7 +30,14 @@ from demandops.model.demand.demand import Application, Demand, InputTopic, Item,
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim, ClaimKey, requesters_of
-from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
+from demandops.model.ledger.ledger import (
+    Changes,
+    ClaimChange,
+    Ledger,
+    World,
+    claim_changes,
+    ledger_of,
+)
 
 # ---- when an application moves, the connections of its demands follow, with type and options ----
 
@@ -47,15 +54,17 @@ def with_moved(
     except of the claims ``done``, because claims that people wrote may read one another.
     """
     ledger, claims = world.ledger, tuple(claims)
-    keys = [claim.key for claim in claims]
     for claim in claims:
         ledger = ledger.replace(claim.key, replace(claim, held=move(claim.application)))
     for claim in claims:
-        # A goal of the reference's action lists its connections itself, and its clients shut down
-        # what they listed. So a move does not change these connections.
-        if not claim.joined:
-            ledger, changed = _followed(replace(world, ledger=ledger), claim, move)
-            keys += changed
+        ledger = carriers.with_moved_routes(
+            replace(world, ledger=ledger), claim, move(claim.application)
+        )
+    demands = dict.fromkeys(claim.demand for claim in claims)
+    held = (c for old in (world.ledger, ledger) for d in demands for c in old.claims_of_demand(d))
+    keys = list(dict.fromkeys(claim.key for claim in held))
+    changes = claim_changes(world.ledger, ledger, keys)
+    ledger, _ = carriers.without_idle_routes(ledger, world.config, changes)
     done |= {claim.key for claim in claims}
     moved = dict.fromkeys(claim.subject.id for claim in claims)
     reading = [each.key for id in moved for each in ledger.claims_reading_outputs(id)]
@@ -65,67 +74,6 @@ def with_moved(
             after, changes = with_moved(replace(world, ledger=ledger), [reader], follow, done)
             ledger, keys = after.ledger, [*keys, *(change.key for change in changes)]
     return replace(world, ledger=ledger), claim_changes(world.ledger, ledger, keys)
-
-
-def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[ClaimKey]]:
-    """Let a demand's connections follow an application, ``claim`` on which is not moved yet."""
-    config, ledger, keys = world.config, world.ledger, list[ClaimKey]()
-    app = claim.application
-    old, new = flows(config, app), flows(config, move(app))
-    before, after = {_path(flow) for flow in old}, {_path(flow) for flow in new}
-    needed = list(new)
-    for other in ledger.claims_of_demand(claim.demand):
-        if other.is_on_application and other.subject != claim.subject:
-            needed += flows(config, other.application)
-    still = {(flow.sender, flow.receiver, flow.target) for flow in needed}
-    carried: dict[tuple[str, str], Connection] = {}
-    # If the application needed connections before and its demand held none of them, the demand
-    # did without, for example by ``connect: none``. Then a move adds none.
-    derives = not old or any(True for flow in old for _ in _carrying(ledger, claim.demand, flow))
-    for flow in old:
-        if _path(flow) in after:
-            continue
-        for held, route in _carrying(ledger, claim.demand, flow):
-            carried[flow.topic, flow.target] = replace(held.connection, topics=(route,))
-            if (flow.sender, flow.receiver, flow.target) not in still:
-                remaining = held.connection.without_topics({(route.source,)})
-                reduced = replace(held, held=remaining) if remaining else None
-                ledger = ledger.replace(held.key, reduced)
-                keys.append(held.key)
-    for flow in new if derives else ():
-        if _path(flow) in before:
-            continue
-        carrier = carried.get((flow.topic, flow.target))
-        former = carrier.topics[0] if carrier else None
-        brought = replace(flow, topic=former.read_topic) if former else flow
-        connection = connection_for(brought, carrier.known_type.word if carrier else "auto", ledger)
-        # If no claim brings the topic to the receiver yet, the connection gets the options of the
-        # one that carried the topic before.
-        if former and not ledger.is_carried_to(flow.receiver, flow.target):
-            same = replace(former, source=brought.topic, target=flow.target, reverse=False)
-            connection = replace(connection, topics=(same,))
-        put = Demand("put", "", (Item(connection, claim.requesters),))
-        (item,) = admission.with_chosen_types(put, config, ledger.connection).demanded
-        booked = replace(claim, held=item.held.booked())
-        if current := ledger.get(booked.key):
-            booked = replace(current, held=current.connection.extended(booked.connection).booked())
-        ledger = ledger.replace(booked.key, booked)
-        keys.append(booked.key)
-    return ledger, keys
-
-
-def _path(flow: Flow) -> tuple[str, str, str, str]:
-    return flow.topic, flow.sender, flow.receiver, flow.target
-
-
-def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
-    for id in ledger.connections_bringing(flow.receiver, flow.target):
-        claim = ledger.get(ClaimKey(Subject(SubjectKind.CONNECTION, id), demand))
-        if claim is not None:
-            for route in claim.connection.topics:
-                ends = route.sender_and_receiver(*claim.connection.nodes)
-                if (*ends, route.written_topic) == (flow.sender, flow.receiver, flow.target):
-                    yield claim, route
 
 
 # ---- relocation: applications and services leave a drained node, and overrides move services ----
@@ -243,7 +191,7 @@ def _moved(
         flow.sender: route
         for claim in claims
         for flow in flows(world.config, claim.application)
-        for _, route in _carrying(world.ledger, claim.demand, flow)
+        for _, route in carriers.carrying(world.ledger, claim.demand, flow)
         if flow.delivery is None and route.read_topic != route.written_topic
     }
     for chosen in islice(choice.candidates(), candidates.MOST_TRIED):
@@ -260,6 +208,18 @@ def _moved(
             return (after, chosen, keys, moved_names), len(reasons) + 1
         reasons.append(f"on {quoted(chosen.node)} {fault.message}")
     return sentences(reasons) or choice.none_fits().message, len(reasons)
+
+
+def _brought_twice(change: ClaimChange, ledger: Ledger) -> Iterator[Fault]:
+    if change.after is None or change.after.is_on_application:
+        return
+    former = change.before.connection.topics if change.before else ()
+    held = ledger.claims_of_demand(change.key.demand)
+    apps = [claim.application for claim in held if claim.is_on_application]
+    connection = change.after.connection
+    for index, words in carriers.chosen_twice(connection, apps, ledger):
+        if connection.topics[index] not in former:
+            yield Fault("conflict", "", words)
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,9 +299,7 @@ def with_restored_moves(request: Restoration, world: World) -> Restoration:
         claim.is_on_application and claim.application.moved for claim in request.claims
     ):
         return request
-    ledger = Ledger(ended=world.ledger.ended)
-    for claim in request.claims:
-        ledger = ledger.replace(claim.key, claim)
+    ledger = replace(ledger_of(request.claims), ended=world.ledger.ended)
     return replace(request, claims=tuple(following_overrides(replace(world, ledger=ledger)).ledger))
 
 
@@ -374,40 +332,9 @@ def _faults(
     for change in changes:
         if change.after:
             yield from collisions.faults_of_claim(change.after, before, after)
-            yield from _brought_twice(change.after, after)
+            yield from _brought_twice(change, after.ledger)
     keys = affected_keys(before, after, changes)
     yield from collisions.name_faults(Demand("drain"), before, after, keys, Changes(changes), names)
-
-
-def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
-    """Yield a fault for each topic that two connections bring to a node from different senders."""
-    if claim.is_on_application:
-        return
-    ledger = after.ledger
-    inputs = {
-        (topic.source, topic.topic)
-        for held in ledger.claims_of_demand(claim.demand)
-        if held.is_on_application
-        for _, topic in held.application.all_inputs()
-    }
-    for route in claim.connection.topics:
-        sender, receiver = route.sender_and_receiver(*claim.connection.nodes)
-        # Of an input that the demand lists, the demand names the source.
-        if (sender, route.read_topic) in inputs:
-            continue
-        target = (receiver, route.written_topic)
-        senders = {
-            from_node
-            for connection in map(ledger.connection, ledger.connections_bringing(*target))
-            if connection is not None
-            for other in connection.topics
-            for from_node, to_node in [other.sender_and_receiver(*connection.nodes)]
-            if (to_node, other.written_topic) == target
-        }
-        for other_sender in sorted(senders - {sender}):
-            topic = quoted(route.written_topic)
-            words = f"{topic} would come from {quoted(sender)} and from {quoted(other_sender)}"
-            yield Fault("conflict", "", words)
 
 
 # ---- changes to the ledger when overrides change or end: kept claims, moved services, markers ----

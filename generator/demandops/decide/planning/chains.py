@@ -176,7 +176,8 @@ def with_held_applications(request: AnyDemand, ledger: Ledger, config: Config) -
                 continue
             readers.setdefault(id, {})[reader.id] = outputs
             if id not in held and (app := _as_booked(id, request.demand, ledger, config)):
-                held[id] = replace(item, needed_by="inputs"), app
+                places = item.places or (f"{item.field}.inputs",)
+                held[id] = replace(item, places=places, is_listed=False), app
                 reading.append(held[id])
     more = (replace(i, held=replace(app, held_for=readers[app.id])) for i, app in held.values())
     return replace(request, demanded=(*request.demanded, *more))

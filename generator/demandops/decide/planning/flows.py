@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from demandops.base import naming
-from demandops.base.naming import Subject, SubjectKind, TopicKey, topic_problem
-from demandops.connections.connection import Connection, Route
-from demandops.connections.connection_types import type_named
+from demandops.base.naming import TopicKey
+from demandops.connections.connection import RouteKey
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import Config
-from demandops.model.demand.demand import AnyDemand, Application, InputTopic, Item
-from demandops.model.ledger.claim import ClaimKey
-from demandops.model.ledger.ledger import Changes, Ledger, World, claim_changes
+from demandops.model.demand.demand import AnyDemand, Application, InputTopic
+from demandops.model.ledger.ledger import Ledger
 from demandops.model.release import ServiceKey
 
 # ---- the topics that services publish, named as the reference names them ----
@@ -140,7 +138,7 @@ def _marked(
 # ---- flows: which topics the services of an application read, and where they come from ----
 #
 # The flows of a demand follow from its own applications and the configuration, never from other
-# demands. So the connections that a demand needs are claimed by it and end with it.
+# demands. So the routes that a demand needs are claimed by it and end with it (:mod:`.carriers`).
 
 
 class PublishedTopic(NamedTuple):
@@ -292,131 +290,15 @@ def _parts(app: Application, service: Service) -> Iterator[tuple[str, Applicatio
         yield node_of(app, service, ""), app
 
 
-# ---- implied connections: those that a demand needs, but does not list ----
-#
-# The demand claims such a connection in the same way as one that it lists. So the connection is
-# shared with other demands, changes when the application moves, and is released with the demand.
-
-# The id, source and target of a connection.
-_Ends: TypeAlias = "tuple[str, ...]"
+def is_bridged(key: RouteKey, config: Config) -> bool:
+    # The initial deployment keeps topic names, so it carries no route that renames a topic.
+    node = config.nodes.get(key.sender)
+    bridged = node.bridged.get(key.receiver, ()) if node else ()
+    return key.topic == key.target and key.topic in bridged
 
 
-def with_implied_connections(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDemand:
-    """Return the request with a connection for each flow that no listed connection brings.
-
-    It is the claimed connection that carries the flow, or else a derived one.
-    """
-    first: dict[_Ends, Item] = {}
-    routes: dict[_Ends, dict[tuple[str, str], Route]] = {}
-    listed = [each.held for each in request.demanded if isinstance(each.held, Connection)]
-    brought = {
-        (route.sender_and_receiver(*connection.nodes)[1], route.written_topic)
-        for connection in listed
-        for route in connection.topics
-    }
-    for item in request.demanded:
-        app = item.held
-        if not isinstance(app, Application):
-            continue
-        places: dict[TopicKey, str] = {
-            (role, topic.topic, topic.source): f"inputs.{role}[{index}]"
-            for role, topics in app.inputs.items()
-            for index, topic in enumerate(topics)
-        }
-        for flow in flows(config, app):
-            # Admission reports an unknown node and a topic that is not valid, so neither gets a
-            # connection here.
-            is_valid = (
-                {flow.sender, flow.receiver} <= config.domain_of.keys()
-                and not topic_problem(flow.topic)
-                and not topic_problem(flow.target)
-            )
-            if (flow.receiver, flow.target) in brought or not is_valid:
-                continue
-            # what is held for its readers keeps the connections that bring its inputs now
-            carrier = carrier_of(flow, ledger) if app.held_for else None
-            if app.connect == "none" and carrier is None:
-                continue
-            needed = carrier or connection_for(flow, app.connect, ledger)
-            field = item.needed_by or places.get(flow.root, "node")
-            if flow.delivery is not None:
-                field = f"deliver[{flow.delivery}]"
-            note = ""
-            if needed.type is not None and app.connect not in ("auto", needed.type.word):
-                topic = needed.topics[0].source
-                note = (
-                    f"already carries {topic} by {needed.type.name}, so {topic} gets no "
-                    f"{app.connect.upper()} connection"
-                )
-            ends = (needed.id, *needed.nodes)
-            first.setdefault(
-                ends, Item(needed, item.requesters, item.field, field, item.term, note)
-            )
-            topics = routes.setdefault(ends, {})
-            for route in needed.topics:
-                names = (route.source, route.target)
-                topics[names] = route if route.type else topics.get(names, route)
-    demanded = list(request.demanded)
-    for index, item in enumerate(demanded):
-        if isinstance(item.held, Connection):
-            more = routes.pop((item.held.id, *item.held.nodes), {})
-            if more:
-                demanded[index] = _with_topics(item, (*item.held.topics, *more.values()))
-    implied = (_with_topics(first[ends], topics.values()) for ends, topics in routes.items())
-    return replace(request, demanded=(*demanded, *implied))
-
-
-def _with_topics(item: Item, topics: Iterable[Route]) -> Item:
-    assert isinstance(item.held, Connection)  # noqa: S101 - callers pass only connections
-    return replace(item, held=replace(item.held, topics=tuple(dict.fromkeys(topics))))
-
-
-def without_idle_deliveries(
-    before: Ledger, after: World, changes: Changes
-) -> tuple[Ledger, Changes]:
-    """Return the ledger and changes, both without deliveries of outputs that are no longer made."""
-    ledger, keys = after.ledger, [change.key for change in changes.claims]
-    # With a decommissioned node a demand may lose an input, and with the input an output of its
-    # application. The demand may still hold the connection that delivers this output from one
-    # remaining node to another, where nothing would come any longer.
-    for change in changes.claims:
-        if change.before is None or change.key.subject.kind is not SubjectKind.APPLICATION:
-            continue
-        remaining = flows(after.config, change.after.application) if change.after else []
-        still = {(flow.receiver, flow.target) for flow in remaining}
-        for flow in flows(after.config, change.before.application):
-            place = (flow.receiver, flow.target)
-            for id in ledger.connections_bringing(*place) if place not in still else ():
-                key = ClaimKey(Subject(SubjectKind.CONNECTION, id), change.key.demand)
-                claim = ledger.get(key)
-                if claim is not None and flow.delivery is not None:
-                    held = claim.held.without_topics({(flow.topic,)})
-                    ledger = ledger.replace(key, replace(claim, held=held) if held else None)
-                    keys.append(key)
-    return ledger, replace(changes, claims=claim_changes(before, ledger, keys))
-
-
-def carrier_of(flow: Flow, ledger: Ledger) -> Connection | None:
-    """Return a claimed connection that brings a flow's target, from any topic of any sender."""
-    for id in ledger.connections_bringing(flow.receiver, flow.target):
-        for connection in (claim.connection for claim in ledger.connection_claims(id)):
-            for route in connection.topics:
-                _, receiver = route.sender_and_receiver(*connection.nodes)
-                if (receiver, route.written_topic) == (flow.receiver, flow.target):
-                    return replace(connection, broker="", topics=(route,))
-    return None
-
-
-def connection_for(flow: Flow, type: str, ledger: Ledger) -> Connection:
-    """Return the claimed connection that carries a flow, or a derived one, only with its topic."""
-    ends, names = (flow.sender, flow.receiver), (flow.topic, flow.target)
-    for id in ledger.connections_bringing(flow.receiver, flow.target):
-        for claim in ledger.connection_claims(id):
-            connection = claim.connection
-            for route in filter(None, map(connection.route, names)):
-                is_same = (route.read_topic, route.written_topic) == names
-                if is_same and route.sender_and_receiver(*connection.nodes) == ends:
-                    return Connection(id, connection.type, *connection.nodes, "", (route,))
-    kind = None if type == "auto" else type_named(type)
-    route = Route(*names, type=flow.type if kind and kind.needs_types else "")
-    return Connection(f"derived/{flow.sender}/{flow.receiver}", kind, *ends, "", (route,))
+def flows_without_carrier(config: Config, app: Application, ledger: Ledger) -> Iterator[Flow]:
+    for flow in flows(config, app):
+        key = RouteKey(flow.sender, flow.topic, flow.receiver, flow.target)
+        if not ledger.is_carried_to(flow.receiver, flow.target) and not is_bridged(key, config):
+            yield flow

@@ -18,7 +18,13 @@ from demandops.connections import connection as routes
 from demandops.connections.connection import Connection, ConnectionType, Route
 from demandops.connections.connection_types import route_faults
 from demandops.decide.planning import overrides, release_keys
-from demandops.decide.planning.flows import outputs, roots_of, topics_of_origin, usual_topic
+from demandops.decide.planning.flows import (
+    is_bridged,
+    outputs,
+    roots_of,
+    topics_of_origin,
+    usual_topic,
+)
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.appdef import Parameter, Scaling, Service
@@ -235,7 +241,7 @@ class _ClaimedConnections:
         topics = tuple(
             route
             for route in connection_topics(claims)
-            if not is_bridged(route, *first.nodes, self.world.config)
+            if not is_bridged(first.key_of(route), self.world.config)
         )
         # A person may have written a claim with a route that this type cannot carry, or have
         # removed from the inventory what the connection needs.
@@ -250,16 +256,11 @@ class _ClaimedConnections:
 
 
 def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
-    return routes.merged_routes(route for claim in claims for route in claim.connection.topics)
-
-
-def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
-    sender, receiver = route.sender_and_receiver(source, target)
-    node = config.nodes.get(sender)
-    # The initial deployment keeps topic names, so it carries no route that renames a topic.
-    if node is None or route.source != route.target:
-        return False
-    return route.read_topic in node.bridged.get(receiver, ())
+    topics = (route for claim in claims for route in claim.connection.topics)
+    return routes.merged_routes(
+        replace(route, implied=False, listed="") if route.implied or route.listed else route
+        for route in topics
+    )
 
 
 def _replicas_of(

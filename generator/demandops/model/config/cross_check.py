@@ -72,6 +72,8 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
     seen: dict[str, str] = {}
     for domain in config.domains.values():
         file, place = reader.place_of(configs.DOMAINS_FILE, domain.name)
+        if domain.broker is not None:
+            reader.check_reference(file, f"{place}.broker", domain.broker, configs.BROKERS_FILE)
         for broker in domain.broker_credentials:
             field = f"{place}.brokerCredentials.{broker}"
             reader.check_reference(file, field, broker, configs.BROKERS_FILE)

@@ -178,8 +178,10 @@ class AccessDomain(CamelModel):
     ``when_full`` says what happens to a demand if the nodes that suit it have no room
     (:mod:`.records`).
 
-    ``ros`` replaces the ROS domain of the nodes. ``broker_credentials`` maps the node of a broker
-    to the credentials that connection ends in this domain use for the broker.
+    ``ros`` replaces the ROS domain of the nodes. ``broker`` is the node of the broker for
+    connections that name none and have none at an end: that of the target's domain, or else of the
+    source's. ``broker_credentials`` maps the node of a broker to the credentials that connection
+    ends in this domain use for the broker.
     """
 
     name: DnsLabel
@@ -195,6 +197,7 @@ class AccessDomain(CamelModel):
     kinds: Items[KindByWord] | None = None
     pod_security: Literal["baseline", "host-network", "privileged"] = "host-network"
     ros: DomainRos | None = None
+    broker: NodeId | None = None
     broker_credentials: dict[NodeId, Credentials] = Field(default_factory=dict)
 
     @property

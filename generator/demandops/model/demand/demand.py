@@ -9,6 +9,7 @@ all hold a :class:`Demand`. "The reference" is the application manager of the pa
 from __future__ import annotations
 
 import json
+import re
 from bisect import bisect_left
 from collections.abc import Container, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -17,7 +18,15 @@ from functools import cached_property
 from itertools import islice, takewhile
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
-from pydantic import AfterValidator, ConfigDict, Field, Strict, StrictBool
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    Strict,
+    StrictBool,
+)
 from pydantic.json_schema import SkipJsonSchema
 
 from demandops.base import naming
@@ -134,14 +143,37 @@ def _with_parameters_json(schema: dict[str, Any]) -> None:
     schema["properties"]["parameters_json"] = texts
 
 
+_CONNECT = type_word("auto", after=("none",))
+
+
+@dataclass(frozen=True, slots=True)
+class Connect:
+    """The type of derived connections for an application's flows and deliveries, and their broker.
+
+    ``auto`` derives them with any type, ``none`` derives none. Without a broker it is written as
+    the word of the type.
+    """
+
+    __pydantic_config__: ClassVar = PART
+
+    type: Annotated[str, _CONNECT] = "auto"
+    broker: str = ""
+
+
+def _read_connect(value: object) -> object:
+    return value if isinstance(value, dict | Connect) else Connect(_CONNECT.func(value))  # type: ignore[call-arg]
+
+
+def _written_connect(connect: Connect) -> object:
+    return {"type": connect.type, "broker": connect.broker} if connect.broker else connect.type
+
+
 @dataclass(frozen=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
-    ``version`` is a version or a channel of the registry. ``connect`` is the type of the derived
-    connections for the application's flows and deliveries: ``auto`` derives them with any type,
-    ``none`` derives none. What a connection of the demand carries needs no derived connection.
-    ``services`` maps service names to nodes.
+    ``version`` is a version or a channel of the registry. ``connect`` says how topics come to it
+    that no connection of the demand carries. ``services`` maps service names to nodes.
     """
 
     __pydantic_config__: ClassVar = ConfigDict(**PART, json_schema_extra=_with_parameters_json)
@@ -153,7 +185,13 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     inputs: Mapping[str, Items[InputTopic]] = field(default_factory=dict)
     parameters: Mapping[str, Any] = field(default_factory=dict)
     version: str = ""
-    connect: Annotated[str, type_word("auto", after=("none",))] = "auto"
+    connect: Annotated[
+        Connect,
+        BeforeValidator(
+            _read_connect, json_schema_input_type=_CONNECT.json_schema_input_type | Connect
+        ),
+        PlainSerializer(_written_connect),
+    ] = Connect()
     deliver: Items[Delivery] = ()
     # The requirements on the node, kept to choose again; None if the demand names the node. A place
     # that requires nothing, as in each ROS message with a node, does not ask for a choice.
@@ -280,13 +318,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         deliver = (*self.deliver, *more.deliver)
         return replace(more, inputs=inputs, parameters=parameters, deliver=deliver)
 
-    def matches_listed(self, listed: object) -> bool:
-        return (
-            isinstance(listed, Application)
-            and listed.node in ("", self.node)
-            and listed.appdef == self.appdef
-        )
-
     def topic_keys(self) -> Iterator[TopicKey]:
         # (role, topic, source) of each input; without inputs one empty key
         for role, topic in self.all_inputs():
@@ -294,9 +325,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         if not any(self.inputs.values()):
             yield ()
 
-    def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
+    def listed_topics(self, listed: Application) -> Iterator[tuple[str, list[TopicKey]]]:
         """Yield (text, matching keys of this application) for each input that a shutdown lists."""
-        assert isinstance(listed, Application)  # noqa: S101 - see matches_listed
         by_name: dict[TopicKey, list[TopicKey]] = {}
         for key in self.topic_keys():
             by_name.setdefault(key[:2], []).append(key)
@@ -431,6 +461,9 @@ def renewed(current: Lease | None, term: Term | None, now: datetime) -> Lease | 
 # ---- demands ----
 
 
+_ROUTE = re.compile(r"topics\[(\d+)\](.*)")
+
+
 @dataclass(frozen=True, slots=True)
 class Item:
     """One application or connection of a demand, and the requesters for whom it is demanded."""
@@ -439,19 +472,23 @@ class Item:
     requesters: tuple[str, ...]
     # where the demand lists it, as in ``applications[0]``
     field: str = ""
-    # Of a connection that the demand needs and does not list: what needs it, as in
-    # ``inputs.ego_data[1]`` of the application. Its faults are reported there.
-    needed_by: str = ""
+    # For each route of a connection, the field of the demand because of which it is on this
+    # connection. Of one that the demand does not list, all faults are reported there.
+    places: tuple[str, ...] = ()
+    is_listed: bool = True
     term: Term | None = None
-    # how a connection differs from the requested one, for a warning in the receipt
-    note: str = ""
     # a sentence for each placed application or service: which node was chosen, and why
     placed: tuple[str, ...] = ()
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
-        if self.needed_by and not path.startswith("requesters"):
-            path = self.needed_by
-        return fault(".".join(filter(None, (self.field, path))), message, code=code)
+        place = ".".join(filter(None, (self.field, path)))
+        route = _ROUTE.fullmatch(path)
+        if self.places and route:
+            place = self.places[int(route[1])]
+            place += route[2] if place.endswith("]") and ".topics[" in place else ""
+        elif self.places and not self.is_listed and not path.startswith("requesters"):
+            place = self.places[0]
+        return fault(place, message, code=code)
 
 
 Operation = Literal[
@@ -484,6 +521,8 @@ class Demand:
     priority: int = 0  # among the demands that wait for room
     # Whether it has all that a demand may leave open, and is admitted. The generator's own are.
     is_complete: bool = False
+    # how what is booked differs from what was demanded, for warnings in the receipt
+    notes: tuple[str, ...] = ()
     # the goal as plain data, which the journal keeps
     goal: Any = field(default=None, compare=False, repr=False)
 

@@ -262,6 +262,8 @@ def _of_older_version(data: dict[str, Any]) -> dict[str, Any]:
         for source, given in topics.items():
             route = dict(given) if isinstance(given, dict) else {"target": given}
             route.pop("requesters", None)
+            if str(held["id"]).startswith("derived/"):  # nobody can list such an id by chance
+                route["implied"] = True
             routes.append({"source": source, **route})
         held["topics"] = routes
     return {"apiVersion": LEDGER_API_VERSION, "kind": "Claim", **claim, on: held}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from operator import attrgetter
@@ -13,7 +13,7 @@ from rpds import HashTrieMap, HashTrieSet
 
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import connection_types
-from demandops.connections.connection import Connection, ConnectionType
+from demandops.connections.connection import Connection, ConnectionType, RouteKey
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override, by_rank, still_active
 from demandops.model.demand.demand import UNSTARTED, Application, InputTopic
@@ -133,6 +133,15 @@ class Ledger:
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
         return self._ids("brings", target, topic)
+
+    def claims_bringing(self, target: str, topic: str) -> tuple[Claim, ...]:
+        return self._claims("brings", target, topic)
+
+    def route_holders(self, key: RouteKey) -> Collection[ClaimKey]:
+        return self.index.get(("route", *key)) or ()
+
+    def bringing(self, target: str, topic: str) -> Collection[ClaimKey]:
+        return self.index.get(("brings", target, topic)) or ()
 
     def is_carried_to(self, target: str, topic: str) -> bool:
         return ("brings", target, topic) in self.index
@@ -275,6 +284,13 @@ class Ledger:
 
     def __len__(self) -> int:
         return sum(len(claims) for claims in self.claims.values())
+
+
+def ledger_of(claims: Iterable[Claim]) -> Ledger:
+    ledger = Ledger()
+    for claim in claims:
+        ledger = ledger.replace(claim.key, claim)
+    return ledger
 
 
 def minute_of(moment: datetime) -> str:
