@@ -108,7 +108,7 @@ class Scenario(FrozenModel):
     """
 
     must: str = Field(min_length=1)
-    appdefs: list[Literal["recorder", "monitor"]] = Field(default_factory=list)
+    appdefs: list[Literal["recorder", "monitor", "planner"]] = Field(default_factory=list)
     config: dict[str, dict[str, Any]] = Field(default_factory=dict)
     invalid: list[ExpectedFault] | None = None
     steps: list[Step] = Field(default_factory=list)

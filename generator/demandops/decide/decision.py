@@ -464,6 +464,8 @@ def notes_on(
                 if change.after.connection.topics[index] not in former:
                     yield f"{words}; a subscriber gets the messages of both"
     yield from warnings.notes(request, before)
+    yield from warnings.unheld_output_notes(request, after)
+    yield from warnings.lost_output_notes(changes, after)
     yield from rendered.blocked
     if isinstance(request, Drain):
         yield from request.stays

@@ -19,7 +19,7 @@ from demandops.decide.checks.collisions import Names
 from demandops.decide.placement import candidates, capacity
 from demandops.decide.placement.candidates import Choice, Chosen, Room
 from demandops.decide.placement.capacity import Need, Usage
-from demandops.decide.planning import overrides
+from demandops.decide.planning import chains, overrides
 from demandops.decide.planning.flows import flows
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.rollback import Restoration, request_for
@@ -42,9 +42,13 @@ Move = Callable[[Application], Application]
 
 
 def with_moved(
-    world: World, claims: Iterable[Claim], move: Move
+    world: World, claims: Iterable[Claim], move: Move, done: frozenset[ClaimKey] = frozenset()
 ) -> tuple[World, tuple[ClaimChange, ...]]:
-    """Return the world with applications moved, followed by connections of their demands."""
+    """Return the world with applications moved, followed by what depends on where they run.
+
+    The connections of their demands follow, and so do the inputs of those that read their outputs,
+    except of the claims ``done``, because claims that people wrote may read one another.
+    """
     ledger, claims = world.ledger, tuple(claims)
     for claim in claims:
         ledger = ledger.replace(claim.key, replace(claim, held=move(claim.application)))
@@ -57,6 +61,14 @@ def with_moved(
     keys = list(dict.fromkeys(claim.key for claim in held))
     changes = claim_changes(world.ledger, ledger, keys)
     ledger, _ = carriers.without_idle_routes(ledger, world.config, changes)
+    done |= {claim.key for claim in claims}
+    moved = dict.fromkeys(claim.subject.id for claim in claims)
+    reading = [each.key for id in moved for each in ledger.claims_reading_outputs(id)]
+    for reader in filter(None, (ledger.get(key) for key in reading if key not in done)):
+        follow = partial(chains.followed, demand=reader.demand, ledger=ledger, config=world.config)
+        if follow(reader.application) != reader.application:
+            after, changes = with_moved(replace(world, ledger=ledger), [reader], follow, done)
+            ledger, keys = after.ledger, [*keys, *(change.key for change in changes)]
     return replace(world, ledger=ledger), claim_changes(world.ledger, ledger, keys)
 
 

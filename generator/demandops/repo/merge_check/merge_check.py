@@ -138,6 +138,7 @@ def check(
                 *warnings.policy_warnings(state),
                 *warnings.unmatched_pattern_warnings(state.config),
                 *warnings.misspelled_topic_warnings(state),
+                *warnings.unheld_output_warnings(state),
                 *edit.changed_bootstraps(wanted),
                 *(
                     topic.warning
