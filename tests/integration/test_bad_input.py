@@ -162,8 +162,8 @@ class TestYamlAttacks:
         texts = ["yes", "null", "~", "1e3", "0o7", "010", "12:30:45", "2026-01-31", "0x1F", "<<"]
         items = [
             f"- {{id: {written}, type: 1, requester_ids: [{written}], source_node_id: vehicle00, "
-            "target_node_id: edge, source_topics: [/a], target_topics: [/a]}"
-            for written in (*(f'"{text}"' for text in texts), "2026-02-01")
+            f"target_node_id: edge, source_topics: [/a{number}], target_topics: [/a{number}]}}"
+            for number, written in enumerate((*(f'"{text}"' for text in texts), "2026-02-01"))
         ]
         on.json("request", "-", stdin="id: x\nconnections:\n" + "\n".join(items))
         connections = on.json("bookkeeping")["connections"]

@@ -105,8 +105,10 @@ class TestRequest:
     def test_json_and_text_tell_the_outcome_of_each(
         self, on: On, demandops: Run, state: GitRepo, tmp_path: Path
     ) -> None:
-        asked = goal([application(), application("other")], id="r", shutdown=True)
-        goals = goal([application()], id="r"), goal([application(node="egde")], id="s"), asked
+        # no broker is at either end, so no connection can be derived
+        app = application(node="vehicle01")
+        asked = goal([app, application("other")], id="r", shutdown=True)
+        goals = goal([app], id="r"), goal([application(node="egde")], id="s"), asked
         git(tmp_path, "clone", "-q", "--bare", str(state.path), "other.git")
         other = GitRepo(tmp_path / "other.git")
         before, given = state.tip, text(*goals)

@@ -114,6 +114,13 @@ def test_a_generator_publishes_the_journal_once_and_keeps_the_proposal_open(
     assert_verified(on, FACTS["main"])
 
 
+DOUBLED = {"vehicle01/edge"}
+CLIENTS_OF_DOUBLED = {
+    "mqtt-vehicle01-edge-source-092a70a6cc97.yaml",
+    "mqtt-vehicle01-edge-target-f918b3fb6980.yaml",
+}
+
+
 def test_an_upgrade_takes_every_claim_and_waiting_demand_along(
     demandops: Run, on: On, state: GitRepo, person: Person, clock: Clock, tmp_path: Path
 ) -> None:
@@ -122,11 +129,19 @@ def test_an_upgrade_takes_every_claim_and_waiting_demand_along(
     manifests = state.manifests()
     assert on("upgrade").code == 0
     after = on("bookkeeping", "--output", "json").json()
+    # a connection whose only topic an older one carries is gone
+    carried, carried_before = after.pop("connections"), before.pop("connections")
     assert after | {"commit": ""} == before | {"commit": ""}
+    gone = carried_before.keys() - carried.keys()
+    assert (gone, carried.keys() - carried_before.keys()) == (DOUBLED, set())
+    listed = (each.get("listed", {}).values() for each in carried.values())
+    assert {id for topics in listed for ids in topics for id in ids} == DOUBLED
     kinds = Counter((file["kind"], file["apiVersion"]) for file in ledger(state))
     assert {version for _, version in kinds} == {"demandops.ledger/v3"}
     assert {kind for kind, _ in kinds} == {"Claim", "WaitingDemand", "EndedOverride"}
-    assert {*state.manifests()} == {*manifests}
+    ended = {*manifests} - {*state.manifests()}
+    assert {*state.manifests()} < {*manifests}
+    assert {path.rpartition("/")[2] for path in ended} == CLIENTS_OF_DOUBLED
     git(tmp_path, "clone", "--quiet", str(state.path), "clone")
     assert demandops("check", tmp_path / "clone").code == 0
     with running(state.path, runtime=clock, fetch_interval=0.05):

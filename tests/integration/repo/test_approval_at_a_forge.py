@@ -84,7 +84,10 @@ def test_a_pull_request_is_opened_and_its_link_told(
         [pull] = hub.pulls
         assert f"{branch} {pull['html_url']} (required by" in proposed.told[-1][1]
         assert (pull["head"], pull["base"]) == (branch, "main")
-        assert pull["title"] == "Join edge/fusion-1, vehicle01/edge"
+        assert pull["title"] == (
+            "Join edge/fusion-1, vehicle01/edge, "
+            "derived/station00/edge/stations/station00/pointcloud"
+        )
         assert "This demand needs approval, as required by ` access domain" in pull["body"]
         petra.merge(branch)
         assert proposed.outcome() == "booked"

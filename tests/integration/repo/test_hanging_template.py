@@ -93,4 +93,4 @@ def test_a_rollback_may_take_longer_than_a_demand(
         who = ("A person", "person@example.org")
         back = demand_goals.rollback(then, drop_newer=False, reason="a test", who=who)
         assert receipt(generator.submit(back)).outcome == "restored"
-    assert len(rig.claims(bare)) == 60
+    assert len(rig.claims(bare)) == 120

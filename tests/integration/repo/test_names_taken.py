@@ -45,7 +45,8 @@ def rival(id: str, name_of: Callable[[str], str]) -> str:
 
 def claims(bare: Path) -> set[str]:
     with reader.opened(str(bare)) as repo:
-        return {claim.subject.id for claim in repo.snapshot().state.ledger}
+        ids = {claim.subject.id for claim in repo.snapshot().state.ledger}
+        return {id for id in ids if not id.startswith("derived/")}
 
 
 @pytest.mark.parametrize("node", ["edge", "cloud"])
@@ -81,7 +82,7 @@ def test_a_claim_by_hand_whose_release_has_the_name_of_another_is_held_back(
 ) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, joining(PAIR[0]))
-        (path,) = rig.claims(bare)
+        (path,) = (each for each in rig.claims(bare) if "/applications/" in each)
         data = yaml.safe_load(read(bare, path))
         data["application"] |= {"id": PAIR[1], "node": "cloud"}
         key = ClaimKey(Subject(SubjectKind.APPLICATION, PAIR[1]), data["demand"])
@@ -104,7 +105,7 @@ def test_a_claim_by_hand_in_the_file_of_another_is_held_back(bare: Path, person:
     first, other = "edge/a", rival("edge/a", path_of)
     with rig.running(bare) as generator:
         rig.book(generator, joining(first))
-        (path,) = rig.claims(bare)
+        (path,) = (each for each in rig.claims(bare) if "/applications/" in each)
         data = yaml.safe_load(read(bare, path))
         data["application"]["id"] = other
         text = yaml.safe_dump(data)

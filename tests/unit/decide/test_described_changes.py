@@ -31,7 +31,7 @@ def test_a_parameter_that_the_values_do_not_use_is_no_part_of_a_change() -> None
 
 
 def test_what_is_listed_twice_is_warned_of_once() -> None:
-    app = {"header": {"id": "a", "node_id": "edge"}, "type": 1}
+    app = {"header": {"id": "a", "node_id": "vehicle01"}, "type": 1}
     app |= {"object_detection_fusion_app": {"requester_ids": ["u"], "ego_data_topics": [_TOPIC]}}
     (warning,) = MemoryRepo().send({"id": "r", "apps": [app, app]}).warnings
     assert "no connection carries /a" in warning

@@ -546,6 +546,16 @@ class Demand:
     def subjects(self) -> tuple[Subject, ...]:
         return tuple(dict.fromkeys(item.held.subject for item in self.demanded))
 
+    def listed_subjects(self) -> set[Subject]:
+        """Return the subjects that the goal lists, whatever connections carry their topics."""
+        listed = {item.held.subject for item in self.demanded if isinstance(item.held, Application)}
+        for item in self.demanded:
+            for route in item.held.topics if isinstance(item.held, Connection) else ():
+                if not route.implied:
+                    id = route.listed or item.held.id
+                    listed.add(Subject(SubjectKind.CONNECTION, id))
+        return listed
+
     def touches(self) -> frozenset[Hashable] | None:
         """Return what keeps demands that share it in their order; None touches everything."""
         if self.operation in ("decommission", "rollback"):

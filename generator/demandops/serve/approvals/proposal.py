@@ -139,7 +139,7 @@ def releases(request: Demand, pending: Sequence[Demand], config: Config) -> bool
         return False
     if proposed_stranger_faults(request, pending, config):
         return False
-    subjects = {subject for other in pending for subject in other.subjects()}
+    subjects = {subject for other in pending for subject in other.listed_subjects()}
     return request.operation == "release" or subjects <= set(request.subjects())
 
 
