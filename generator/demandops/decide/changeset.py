@@ -94,8 +94,7 @@ def plan_change(
     """Return what follows from a change of the ledger, before any of it is rendered.
 
     ``keys`` are those of the releases that may differ, and ``plans`` are releases of ``before``
-    that the caller has planned already. ``checkpoint`` is called for each file and release; it may
-    raise an exception to end the work.
+    that are planned already. ``checkpoint`` may raise an exception to end the work.
     """
     files = _ledger_files(after.ledger, changes, checkpoint)
     # before anything is planned, because a claim's file is the smallest of the files that need it
@@ -122,12 +121,10 @@ def render_change(
     """Return the changes in the state repo that follow from a planned change.
 
     With ``keeps_late``, a release whose values take too long to compute keeps its file, instead of
-    OverLimit. ``checkpoint`` is called for each release, as in :func:`plan_change`.
+    OverLimit.
     """
     files, texts = {**planned.ledger_files}, _Texts(config, evaluate)
-    releases = []
-    shaped: set[str] = set()
-    blocked: list[str] = []
+    releases, shaped, blocked = list[ReleaseChange](), set[str](), list[str]()
     for key, new in planned.plans.items():
         checkpoint()
         old = planned.former[key]

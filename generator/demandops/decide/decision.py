@@ -11,6 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cache
 from typing import Literal, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
@@ -144,12 +145,7 @@ def decide(
     # what was booked must be released, however long that takes
     if demand.is_complete or not demand.adds_claims:
         checkpoint = _no_limit
-    told = set[Stage]()
-
-    def tell(stage: Stage) -> None:
-        if stage not in told:
-            told.add(stage)
-            on_stage(stage)
+    tell = cache(on_stage)  # once for each stage, because there may be several attempts
 
     def throttled(request: Demand) -> Demand:
         if too_soon := tuple(throttle(request, state.config)):
@@ -160,7 +156,8 @@ def decide(
         if not request.is_complete:
             # in this order, because a demand with faults does not count against the limits
             request = throttled(admitted(request, state, faults, checkpoint))
-        return _booked(state, request, now, read, tell, checkpoint)
+        tell("admitted")
+        return _booked(state, request, now, read, checkpoint)
 
     try:
         try:
@@ -170,12 +167,14 @@ def decide(
             if wait is None:
                 raise
             throttled(demand)
-            booked = _booked(state, wait, now, read, tell, checkpoint)
-        return _rendered(state, booked, read, tell, checkpoint)
+            booked = attempt(wait)
+        decision = _rendered(state, booked, read, checkpoint)
     except OverBudget as spent:
         raise _refused(state, demand, [fault("", str(spent), code="too-large")]) from None
     except (_TooSoon, Refused) as refused:
         raise _refused(state, demand, refused.faults) from None
+    tell("booked")
+    return decision
 
 
 class _TooSoon(Exception):
@@ -308,12 +307,7 @@ class _Booked:
 
 
 def _booked(
-    state: State,
-    request: Demand,
-    now: datetime,
-    read: FileReader,
-    tell: Callable[[Stage], None],
-    checkpoint: Checkpoint,
+    state: State, request: Demand, now: datetime, read: FileReader, checkpoint: Checkpoint
 ) -> _Booked:
     if isinstance(request, Drain):
         most = placement.MOST_ATTEMPTS
@@ -325,7 +319,6 @@ def _booked(
         request = relocation.with_restored_moves(request, state)
         if faults := list(rollback.faults(request, state)):
             raise Refused(faults)
-    tell("admitted")
     checkpoint()
     if strangers := list(permission.owner_faults(request, state.ledger, state.config)):
         raise Refused(strangers)
@@ -382,13 +375,7 @@ def _booked(
 # ---- render ----
 
 
-def _rendered(
-    state: State,
-    booked: _Booked,
-    read: FileReader,
-    tell: Callable[[Stage], None],
-    checkpoint: Checkpoint,
-) -> Decision:
+def _rendered(state: State, booked: _Booked, read: FileReader, checkpoint: Checkpoint) -> Decision:
     request, changes, config = booked.request, booked.changes, state.config
     rendered = changeset.render_change(
         booked.planned,
@@ -402,7 +389,6 @@ def _rendered(
     usage = state.usage().plus(booked.grown)
     after = state.followed_by(booked.after.ledger, booked.planned, usage)
     checkpoint()
-    tell("booked")
     outcome: Outcome = "unchanged"
     if changes.claims or changes.waiting or isinstance(request, Wait):
         outcome = _OUTCOMES.get(request.operation, "released")

@@ -7,6 +7,7 @@ alike.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -132,14 +133,13 @@ class _Places(Generic[_Result]):
         self._last: tuple[tuple[Item, ...], _Result] | None = None
 
     def _whole_room(self) -> Room:
-        request, state = self._request, self._state
-        own = list(state.ledger.claims_of_demand(request.demand))
-        own += (c for subject in request.subjects() for c in state.ledger.kept_claims(subject))
+        request, ledger = self._request, self._state.ledger
+        kept = (each for subject in request.subjects() for each in ledger.kept_claims(subject))
+        own = [*ledger.claims_of_demand(request.demand), *kept]
         nodes = {node for c in own if c.is_on_application for node in c.application.needed_nodes()}
-        room = Room(state, state.usage(), nodes)
         apps = (item.held for item in request.demanded if isinstance(item.held, Application))
-        room.placed.update(app.node for app in apps if app.node)
-        return room
+        placed = Counter(app.node for app in apps if app.node)
+        return Room(self._state, self._state.usage(), nodes, placed=placed)
 
     def placed(self) -> tuple[Demand, list[Fault]]:
         """Return the request with the best node for each application and service, and the faults.
@@ -208,10 +208,7 @@ class _Places(Generic[_Result]):
     def _services_left(self, index: int, item: Item, app: Application) -> list[Service]:
         """Return the services that still need a node; those that are named or booked get theirs."""
         request, ledger, config = self._request, self._state.ledger, self._state.config
-        claims = ledger.claims_on(app.subject)
-        first = claims[0].application if claims else None
-        if first and first.appdef != app.appdef:
-            first = None
+        claims, first = ledger.claims_on(app.subject), self._booked_as(app)
         if first and (request.is_reference or _of_another(claims, request.demand)):
             # What others hold stays where it is. So does what a goal of the reference's action
             # holds: its connections are those that it lists, and would not follow.
@@ -254,11 +251,14 @@ class _Places(Generic[_Result]):
         self._demanded[index] = replace(item, held=replace(app, services=kept | {**app.services}))
         return _services_to_place(app, self._state)
 
+    def _booked_as(self, app: Application) -> Application | None:
+        booked = self._state.ledger.application(app.id)
+        return booked if booked and booked.appdef == app.appdef else None
+
     def _place_service(self, index: int, service: Service) -> None:
         choice = self._choice(self._demanded[index], requirement_of(service), service)
-        first = self._state.ledger.application(choice.app.id)
-        is_same = first and first.appdef == choice.app.appdef
-        here = first.services.get(service.name, "") if first and is_same else ""
+        first = self._booked_as(choice.app)
+        here = first.services.get(service.name, "") if first else ""
         shared = _shared_node(choice.app, service, self._state)
         chosen = None
         if here and (here == shared or choice.fits(here)):

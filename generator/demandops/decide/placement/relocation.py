@@ -112,7 +112,7 @@ def with_moves(
                 continue
             choice = _choice_for(world, claims, service, usage)
             try:
-                chosen, move = choice.first(_attempt_of(world, claims, service, usage, names))
+                chosen, move = choice.first(partial(_moved, world, names, usage, claims, service))
             except Refused as refusal:
                 stays.append(f"{what[0]} stays, because {refusal.faults[0].message}")
             else:
@@ -179,7 +179,7 @@ def _choice_for(
 
 @dataclass(frozen=True, slots=True)
 class _Move:
-    """A move of claims to other nodes: the world and the names after it, and what it changes."""
+    """A move of claims to another node: the world and the names after it, and what it changes."""
 
     world: World
     names: Names
@@ -187,37 +187,34 @@ class _Move:
     grown: Mapping[Need, int]
 
 
-def _attempt_of(
-    world: World, claims: tuple[Claim, ...], service: Service | None, usage: Usage, names: Names
-) -> Callable[[Chosen], _Move]:
-    """Return the attempt to move claims to a node; it raises Refused if the move has a fault."""
-    # On the sender's own node, no connection would rename the topic.
-    renamed = {
-        flow.sender: route
-        for claim in claims
-        for flow in flows(world.config, claim.application)
-        for _, route in carriers.carrying(world.ledger, claim.demand, flow)
-        if flow.delivery is None and route.read_topic != route.written_topic
-    }
-
-    def attempt(chosen: Chosen) -> _Move:
-        node = chosen.node
-        if route := renamed.get(node):
-            message = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
-            raise Refused.at("", message)
-        move = partial(candidates.on_node, node=node, service=service, world=world)
-        after, changes = with_moved(world, claims, move)
-        keys = affected_keys(world, after, changes)
-        followed = collisions.followed(names, world, after, keys)
-        if faults := [*islice(_faults(world, after, changes, followed), 1)]:
-            raise Refused(faults)
-        grown = capacity.growth_by(world, after, changes)
-        host = world.config.host_of(node)
-        there = {need: amount for need, amount in grown.items() if need[0] == host}
-        capacity.refuse_excess(usage, there, world.config)
-        return _Move(after, followed, changes, grown)
-
-    return attempt
+def _moved(
+    world: World,
+    names: Names,
+    usage: Usage,
+    claims: tuple[Claim, ...],
+    service: Service | None,
+    chosen: Chosen,
+) -> _Move:
+    """Return the move of claims to a node; raise Refused if it would cause a fault."""
+    for claim in claims:
+        for flow in flows(world.config, claim.application):
+            for _, route in carriers.carrying(world.ledger, claim.demand, flow):
+                # On the sender's own node, no connection would rename the topic.
+                renamed = flow.delivery is None and route.read_topic != route.written_topic
+                if renamed and flow.sender == chosen.node:
+                    message = (
+                        f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
+                    )
+                    raise Refused.at("", message)
+    move = partial(candidates.on_node, node=chosen.node, service=service, world=world)
+    after, changes = with_moved(world, claims, move)
+    followed = collisions.followed(names, world, after, affected_keys(world, after, changes))
+    if faults := [*islice(_faults(world, after, changes, followed), 1)]:
+        raise Refused(faults)
+    grown, host = capacity.growth_by(world, after, changes), world.config.host_of(chosen.node)
+    there = {need: amount for need, amount in grown.items() if need[0] == host}
+    capacity.refuse_excess(usage, there, world.config)
+    return _Move(after, followed, changes, grown)
 
 
 def _brought_twice(change: ClaimChange, ledger: Ledger) -> Iterator[Fault]:
