@@ -42,6 +42,7 @@ _PLACE = {name: name for name in ("role", "labels", "capabilities", "properties"
 _DELIVERY = {"output": "output", "node": "node_id", "topic": "topic_name"}
 _POSITION = {"node": "node_id", "x": "x", "y": "y"}
 _INPUT = {"topic": "topic_name", "source": "source_node_id", "type": "type"}
+_INPUT |= {"application": "application_id", "output": "output"}
 _CONNECTION = {
     "id": "id",
     "source": "source_node_id",

@@ -16,7 +16,7 @@ from demandops.model.config.config import (
     NODES_FILE,
     Config,
 )
-from demandops.serve.timing.pauses_and_limits import DEFAULT_INTERVAL, parse_interval
+from demandops.serve.agenda import DEFAULT_INTERVAL, parse_interval
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node

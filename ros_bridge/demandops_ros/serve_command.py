@@ -20,9 +20,9 @@ from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.leadership import Leadership
 from demandops.cluster.rollouts import RolloutWatcher
 from demandops.repo.reader import Reader
+from demandops.serve.agenda import DEFAULT_INTERVAL, parse_interval
 from demandops.serve.generator import Generator
 from demandops.serve.http_server import PushWebhook
-from demandops.serve.timing.pauses_and_limits import DEFAULT_INTERVAL, parse_interval
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from rclpy.logging import get_logger

@@ -33,10 +33,10 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.repo.forge import ForgeError, Gitea, GitHub
 from demandops.repo.git import local_repository as addresses
-from demandops.repo.history import commit_log, revisions
+from demandops.repo.history import commit_log, commit_message, revisions
 from demandops.repo.write import journal
+from demandops.serve.demands import ticket_from_journal
 from demandops.serve.http_server import PushWebhook
-from demandops.serve.queue import ticket_from_journal
 from demandops_interfaces.action import Demand
 from demandops_ros import messages
 from hypothesis import strategies as st
@@ -286,12 +286,11 @@ def end_of_override(data: bytes) -> None:
 
 
 def journal_line(data: bytes) -> None:
-    for entry in journal.parse(data, Path("journal")).values():
-        ticket = ticket_from_journal(entry)
+    for record in journal.parse(data, Path("journal")).values():
+        ticket = ticket_from_journal(record)
         assert ticket.received < NOW.replace(year=9999)
-        assert [*journal.parse(journal._sealed([entry.record()], "")[0], Path())] == [
-            entry.operation
-        ]
+        again = journal.parse(journal._sealed([record], "")[0], Path())
+        assert again == {ticket.operation: record}
 
 
 def commit(data: bytes) -> None:
@@ -305,7 +304,7 @@ def commit(data: bytes) -> None:
     entry = commit_log.entry_of(found)
     assert entry.by_generator in (True, False)
     commit_log.author_of(found)
-    revisions.format_time(entry.time)
+    commit_message.time_text(entry.time)
 
 
 def address(data: bytes) -> None:

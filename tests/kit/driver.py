@@ -31,8 +31,8 @@ from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.journal import Journal
 from demandops.repo.write.proposal_branch import ProposalBranches
 from demandops.serve import worker
+from demandops.serve.demands import Receipt, Ticket
 from demandops.serve.generator import Generator
-from demandops.serve.queue import Receipt, Ticket
 
 from tests.kit import sync
 from tests.kit.limits import PATIENCE_S

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from demandops.base.errors import InvalidInput
+from demandops.serve.demands import Receipt, Ticket
 from demandops.serve.generator import Generator
-from demandops.serve.queue import Receipt, Ticket
 
 from tests.kit.goals import Goal
 from tests.kit.limits import PATIENCE_S
@@ -42,6 +42,11 @@ def outcome(ticket: Ticket) -> str:
     if isinstance(error, InvalidInput):
         return error.faults[0].code
     return type(error).__name__ if error else receipt(ticket).outcome
+
+
+def journaled(operation: str, goal: object, received: str, base: str) -> dict[str, object]:
+    """Return a line of the journal of a generator that died before it answered a demand."""
+    return {"operation": operation, "goal": goal, "received": received, "base": base}
 
 
 def wait_until_queued(tickets: Iterable[Ticket]) -> None:

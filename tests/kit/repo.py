@@ -21,9 +21,8 @@ import pygit2
 import yaml
 from demandops.decide.state import State
 from demandops.repo import new_repo, reader
-from demandops.repo.git import tree as trees
 from demandops.repo.git.objects import NewObjects
-from demandops.repo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME
+from demandops.repo.history.commit_message import GENERATOR_EMAIL, GENERATOR_NAME
 from demandops.repo.load import snapshot as snapshots
 from demandops.views.bookkeeping import as_data, bookkeeping
 
@@ -73,7 +72,7 @@ def write_tree(
     repo: pygit2.Repository, base: pygit2.Tree | None, files: Mapping[str, str | None]
 ) -> pygit2.Oid:
     objects = NewObjects(repo)
-    tree = trees.write(objects, base, files)
+    tree = objects.add_tree(base, files)
     with objects.packed(tree):
         return tree
 

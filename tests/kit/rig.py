@@ -7,6 +7,7 @@ from tests.kit.generator import (
     Stages,
     book,
     busy,
+    journaled,
     outcome,
     receipt,
     restart,

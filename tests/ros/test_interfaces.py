@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 from application_manager_interfaces.action import DeploymentRequest
 from application_manager_interfaces.msg import Application, Connection
+from demandops.model.demand.goals import read_goal
 from demandops_interfaces.srv import GetBookkeeping
-from demandops_ros.messages import demand_goal_from_data, fill_message
+from demandops_ros.messages import demand_goal_from_data, demand_goal_to_data, fill_message
 
-from tests.kit import plain_yaml
+from tests.kit import plain_yaml, rich
 
 REFUSED = plain_yaml.load(Path(__file__).with_name("refused.yaml").read_text())
 OURS = "application_manager_interfaces"
@@ -42,6 +43,12 @@ def test_the_bookkeeping_is_a_service() -> None:
     assert GetBookkeeping.Request.get_fields_and_field_types() == {"at": "string"}
     texts = dict.fromkeys(["message", "commit", "bookkeeping_json"], "string")
     assert GetBookkeeping.Response.get_fields_and_field_types() == {"ok": "boolean", **texts}
+
+
+def test_a_message_carries_every_field_of_a_demand() -> None:
+    goal = rich.own_goal()
+    carried = read_goal(demand_goal_to_data(demand_goal_from_data(goal)))
+    assert carried.demanded == read_goal(goal).demanded
 
 
 @pytest.mark.parametrize("wrong", REFUSED["demands"])

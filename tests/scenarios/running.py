@@ -16,7 +16,8 @@ import yaml
 from demandops.base.errors import Fault, Refused
 from demandops.decide.booking import Drain
 from demandops.decide.decision import Decision, decide
-from demandops.decide.placement.relocation import changed_claim_files, following_overrides
+from demandops.decide.edits import changed_claim_files
+from demandops.decide.placement.relocation import following_overrides
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.base_model import FrozenModel, parse_file, seconds_of
 from demandops.model.config.load import load
@@ -24,8 +25,7 @@ from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import in_turn
-from demandops.serve.timing.expiry import LeaseExpiry
-from demandops.serve.timing.pauses_and_limits import RateLimit
+from demandops.serve.agenda import LeaseExpiry, RateLimit
 from pydantic import Field, model_validator
 
 from tests.kit import plain_yaml
@@ -108,7 +108,7 @@ class Scenario(FrozenModel):
     """
 
     must: str = Field(min_length=1)
-    appdefs: list[Literal["recorder", "monitor"]] = Field(default_factory=list)
+    appdefs: list[Literal["recorder", "monitor", "planner"]] = Field(default_factory=list)
     config: dict[str, dict[str, Any]] = Field(default_factory=dict)
     invalid: list[ExpectedFault] | None = None
     steps: list[Step] = Field(default_factory=list)

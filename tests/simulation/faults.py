@@ -15,32 +15,28 @@ from typing import Any
 from demandops.base.errors import InvalidInput
 from demandops.connections import connection
 from demandops.connections.connection import ConnectionType, Route
-from demandops.decide import booking, changeset, decision
+from demandops.decide import booking, changeset, decision, edits
 from demandops.decide.admission import completing, permission
 from demandops.decide.checks import quotas
 from demandops.decide.decision import Decision
-from demandops.decide.placement import placement, relocation
+from demandops.decide.placement import capacity, placement
 from demandops.decide.placement.candidates import Choice
-from demandops.decide.placement.capacity import Room, Usage
+from demandops.decide.placement.capacity import Usage
 from demandops.decide.planning import overrides, planner, release_keys
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Lease
 from demandops.model.ledger import ledger
 from demandops.model.ledger.claim import Claim, path_of, text_of
-from demandops.model.ledger.records import Wait, WaitingDemand
+from demandops.model.ledger.records import WaitingDemand
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.load import snapshot
 from demandops.repo.write import journal
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.proposal_branch import ProposalBranches
-from demandops.serve import demand_lifecycle, generator
+from demandops.serve import agenda, demands
+from demandops.serve.agenda import Draining, LeaseExpiry, WaitingTurns
 from demandops.serve.approvals.approvals import Approvals
-from demandops.serve.demand_lifecycle import Demands
-from demandops.serve.evaluation import Evaluator
-from demandops.serve.queue import Receipt, Ticket
-from demandops.serve.timing import agenda, expiry
-from demandops.serve.timing.agenda import Draining, WaitingTurns
-from demandops.serve.timing.expiry import LeaseExpiry
+from demandops.serve.demands import Demands, Receipt, Ticket
 from demandops.serve.worker import Worker
 
 Wrong = Callable[..., Any]
@@ -217,12 +213,12 @@ plant("let_the_last_in_first", 6, agenda, "in_turn", in_reverse)
 plant("ignore_priorities", 44, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
 
 
-@wrong(13, decision, "admitted")
-def begin_the_wait_anew(admitted: Any, state: Any, goal: Any, now: Any, *more: Any) -> Any:
-    request = admitted(state, goal, now, *more)
-    if isinstance(request, Wait) and request.waiting is not None:
-        return replace(request, waiting=replace(request.waiting, since=now))
-    return request
+@wrong(13, decision, "_wait")
+def begin_the_wait_anew(
+    wait: Any, state: Any, demand: Any, reasons: Any, now: Any, *more: Any
+) -> Any:
+    request = wait(state, demand, reasons, now, *more)
+    return request and replace(request, waiting=replace(request.waiting, since=now))
 
 
 plant("forget_those_that_wait", 6, WaitingTurns, "is_due", nothing)
@@ -231,8 +227,7 @@ plant("leave_drained_nodes_full", 4, Draining, "is_due", nothing)
 plant("leave_drained_nodes_full", 4, Draining, "move_due", nothing)
 plant("place_on_drained_nodes", 3, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 0, placement, "_booked", nothing)
-plant("count_no_room", 3, Choice, "_shortage", lambda *_: [])
-plant("count_no_room", 3, Room, "is_full", nothing)
+plant("count_no_room", 3, capacity, "exceeded", lambda *_: [])
 
 
 @wrong(0, Usage, "plus")
@@ -243,12 +238,12 @@ def count_released_room_as_taken(plus: Any, usage: Any, more: Any) -> Any:
 # ---- overrides ----
 
 
-@wrong(8, changeset, "build_changeset")
+@wrong(8, changeset, "plan_change")
 def apply_no_override_to_what_a_demand_changes(
-    build: Any, before: Any, after: Any, *more: Any
+    plan: Any, before: Any, after: Any, *more: Any
 ) -> Any:
     object.__setattr__(after, "overrides", ())
-    return build(before, after, *more)
+    return plan(before, after, *more)
 
 
 @wrong(1, CommitBatch, "_followed")
@@ -269,10 +264,14 @@ plant("run_what_is_denied", 26, release_keys, "without_suspended", itself)
 plant("book_what_is_denied", 27, quotas, "denial_faults", lambda *_: ())
 
 
-@wrong(6, expiry, "expired_overrides")
-@wrong(10, relocation, "expired_overrides")
+@wrong(10, edits, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
+
+
+@wrong(6, agenda, "_ends")
+def end_overrides_early_one_by_one(ends: Any, state: Any) -> Any:
+    return [(end - timedelta(minutes=2), name) for end, name in ends(state)]
 
 
 # ---- publishing ----
@@ -375,10 +374,10 @@ def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
 
 
 plant("resume_in_reverse", 1, journal, "read", lambda read, path: dict([*read(path).items()][::-1]))
-plant("skip_the_search_for_operations", 22, Evaluator, "published_before", lambda *_: [])
+plant("skip_the_search_for_operations", 22, Worker, "_published_before", lambda *_: [])
 
 
-@wrong(30, generator.state_in_effect, "first_snapshot")
+@wrong(30, snapshot, "first_snapshot")
 def start_without_overrides(first: Any, *given: Any) -> Any:
     found = first(*given)
     config = replace(found.state.config, overrides={})
@@ -394,10 +393,10 @@ _known = set[str]()
 """The demands whose proposals a generator has forgotten at a restart."""
 
 
-def _forget_proposal(resumed: Any, entry: Any) -> Ticket:
-    if entry.proposal:
-        _known.add(entry.goal.get("demand", ""))
-    return resumed(replace(entry, proposal=None))
+def _forget_proposal(resumed: Any, record: Any) -> Ticket:
+    if record.get("proposal"):
+        _known.add(record["goal"].get("demand", ""))
+    return resumed({key: value for key, value in record.items() if key != "proposal"})
 
 
 @wrong(6, permission, "approval_reasons")
@@ -406,5 +405,5 @@ def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> tup
 
 
 FAULTS["skip_approval_after_a_restart"].parts.append(
-    (demand_lifecycle, "ticket_from_journal", _forget_proposal)
+    (demands, "ticket_from_journal", _forget_proposal)
 )

@@ -13,7 +13,7 @@ from typing import Any
 
 import pygit2
 from demandops.repo.git.repository import MAIN
-from demandops.serve.timing.expiry import LONGEST_WAIT_S
+from demandops.serve.agenda import LONGEST_WAIT_S
 
 from tests.kit import plain_yaml, repo
 from tests.kit.config import texts_below

@@ -18,8 +18,9 @@ from demandops.model.ledger.claim import Claim
 from demandops.repo import verification
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import MAIN
-from demandops.repo.history.commit_log import PROPOSAL, entry_of
-from demandops.serve.queue import Ticket
+from demandops.repo.history.commit_log import entry_of
+from demandops.repo.history.commit_message import PROPOSAL
+from demandops.serve.demands import Ticket
 
 from tests.kit import plain_yaml
 from tests.kit.promises import claims_of, name_of
@@ -204,10 +205,10 @@ class Oracle:
 
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
+        files = [(file["goal"], str(file["since"])) for file in map(plain_yaml.load, texts)]
         return {
-            goal["demand"]: (goal.get("priority", 0), str(since), frozenset(goal["requesters"]))
-            for one in map(plain_yaml.load, texts)
-            for goal, since in [(one["goal"], one["since"])]
+            goal["demand"]: (goal.get("priority", 0), since, frozenset(goal["requesters"]))
+            for goal, since in files
         }
 
     def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:

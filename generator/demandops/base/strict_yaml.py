@@ -184,11 +184,8 @@ def _events(value: Any) -> Iterator[yaml.Event]:  # noqa: ANN401
             yield from _events(item)
         yield _MAPPING[1]
     else:
-        yield yaml.ScalarEvent(None, None, (True, False), _number(value))
-
-
-def _number(value: object) -> str:
-    return str(_REPRESENTER.represent_data(value).value)
+        number = str(_REPRESENTER.represent_data(value).value)
+        yield yaml.ScalarEvent(None, None, (True, False), number)
 
 
 @_cached
@@ -331,7 +328,7 @@ def _block(value: Any, indent: str) -> str:  # noqa: ANN401
             block = _block(item, indent if isinstance(item, list | tuple) else inner)
             fields.append(f"\n{indent}{_simple_text(key)}:{block}")
         return "".join(fields) or " {}"
-    return f" {_number(value)}"
+    return f" {_REPRESENTER.represent_data(value).value}"
 
 
 @_cached

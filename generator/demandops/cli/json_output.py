@@ -117,6 +117,8 @@ def claim_data(claim: Claim) -> Json:
         "version": (app and app.version) or None,
         "place": plain(app.place) if app and app.place else None,
         "services": dict(sorted(app.services.items())) if app and app.services else None,
+        "reads": {id: [*outputs] for id, outputs in app.read_outputs.items()} if app else {},
+        "held_for": {id: [*outputs] for id, outputs in app.held_for.items()} if app else {},
         "requesters": list(claim.requesters),
         "since": time_data(claim.booked),
         "lease": lease_data(claim.lease),

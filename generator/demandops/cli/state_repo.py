@@ -361,8 +361,12 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
     rows, lines = [], []
     for each in journals:
         demands = [
-            {"operation_id": demand.operation, "received": demand.received, "goal": demand.goal}
-            for demand in each.demands
+            {
+                "operation_id": record["operation"],
+                "received": record["received"],
+                "goal": record["goal"],
+            }
+            for record in each.demands
         ]
         rows.append(
             {
@@ -372,7 +376,9 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
                 "demands": demands,
             }
         )
-        lines += [f"{demand.operation}  received {demand.received}" for demand in each.demands]
+        lines += [
+            f"{record['operation']}  received {record['received']}" for record in each.demands
+        ]
         if each.set_aside:
             lines.append(f"the damaged journal {each.file} is now called {each.set_aside}")
     number = sum(len(each.demands) for each in journals)

@@ -39,7 +39,7 @@ def with_implied_routes(request: AnyDemand, ledger: Ledger, config: Config) -> A
     standing = _StandingRoutes(ledger)
     for item in request.demanded:
         app = item.held
-        if not isinstance(app, Application) or app.connect.type == "none":
+        if not isinstance(app, Application) or (app.connect.type == "none" and not app.held_for):
             continue
         demand = _demand_of(request, item)
         places: dict[TopicKey, str] = {
@@ -64,11 +64,14 @@ def with_implied_routes(request: AnyDemand, ledger: Ledger, config: Config) -> A
                 if is_join and claim.demand == demand and not served.implied:
                     continue
                 topic = served.read_topic
+            elif app.connect.type == "none":
+                continue  # held for its readers, with the connections that bring its inputs now
             place = places.get(flow.root, "node")
             if flow.delivery is not None:
                 place = f"deliver[{flow.delivery}]"
-            connection = _implied(flow, app.connect, Route(topic, flow.target))
-            place = f"{item.field}.{place}"
+            connect = Connect() if app.connect.type == "none" else app.connect
+            connection = _implied(flow, connect, Route(topic, flow.target))
+            place = item.places[0] if item.places else f"{item.field}.{place}"
             more = Item(connection, item.requesters, item.field, (place,), is_listed=False)
             demanded.append(more)
     return replace(request, demanded=tuple(demanded))

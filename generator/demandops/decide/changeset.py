@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Any, Literal
@@ -27,7 +27,7 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Changes, Ledger, World
 from demandops.model.release import Release, ServiceRelease
-from demandops.render import manifests, release_file
+from demandops.render import gitops
 from demandops.render.gitops import path_of
 from demandops.templating.values import Evaluate
 
@@ -60,6 +60,17 @@ class ReleaseChange:
 
 
 @dataclass(frozen=True, slots=True)
+class PlannedChange:
+    """What a change of the ledger writes there, and the releases that it may affect."""
+
+    ledger_files: Mapping[str, str | None]
+    # each release that the change may affect, as it is after the change; None if it is gone
+    plans: Mapping[ReleaseKey, Release | None]
+    # the same releases before the change; None if there was none, or if it could not be planned
+    former: Mapping[ReleaseKey, Release | None]
+
+
+@dataclass(frozen=True, slots=True)
 class Changeset:
     """The files to write and the releases that change. A file whose text is None is removed."""
 
@@ -69,49 +80,54 @@ class Changeset:
     overrides: tuple[str, ...] = ()
     # a warning for each release that a ``hold`` override keeps from changing
     blocked: tuple[str, ...] = ()
-    # each release that the change may affect, as it is after the change; None if it is gone
-    plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    # the same releases before the change; None if there was none, or if it could not be planned
-    former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
 
 
-def build_changeset(  # noqa: PLR0913 - each is an input of its own
+def plan_change(
     before: World,
     after: World,
     changes: Changes,
     keys: Iterable[ReleaseKey],
-    evaluate: Evaluate,
     read: FileReader,
     plans: Mapping[ReleaseKey, Release] = MappingProxyType({}),
-    *,
-    keeps_late: bool = False,
     checkpoint: Callable[[], None] = lambda: None,
-) -> Changeset:
-    """Return the changes in the state repo that follow from a change of the ledger.
+) -> PlannedChange:
+    """Return what follows from a change of the ledger, before any of it is rendered.
 
     ``keys`` are those of the releases that may differ, and ``plans`` are releases of ``before``
-    that the caller has planned already. With ``keeps_late``, a release whose values take too long
-    to compute keeps its file, instead of OverLimit. ``checkpoint`` is called for each file and
-    release; it may raise an exception to end the work.
+    that are planned already. ``checkpoint`` may raise an exception to end the work.
     """
-    most = after.config.repo_settings.limits.file_bytes
     files = _ledger_files(after.ledger, changes, checkpoint)
     # before anything is planned, because a claim's file is the smallest of the files that need it
-    _refuse_large(files, most, read)
-    releases = []
-    shaped: set[str] = set()
-    blocked: list[str] = []
+    _refuse_large(files, after.config.repo_settings.limits.file_bytes, read)
     now, former = dict[ReleaseKey, Release | None](), dict[ReleaseKey, Release | None]()
-    for key in keys:  # all before any is rendered, because that takes longer
+    for key in keys:
         checkpoint()
         now[key] = plan(after, key)
         former[key] = plans.get(key)
         with suppress(Refused):  # what could not be planned before must not stop its remedy
             former[key] = former[key] or plan(before, key)
-    texts = _Texts(after.config, evaluate)
-    for key, new in now.items():
+    return PlannedChange(files, now, former)
+
+
+def render_change(
+    planned: PlannedChange,
+    config: Config,
+    evaluate: Evaluate,
+    read: FileReader,
+    *,
+    keeps_late: bool = False,
+    checkpoint: Callable[[], None] = lambda: None,
+) -> Changeset:
+    """Return the changes in the state repo that follow from a planned change.
+
+    With ``keeps_late``, a release whose values take too long to compute keeps its file, instead of
+    OverLimit.
+    """
+    files, texts = {**planned.ledger_files}, _Texts(config, evaluate)
+    releases, shaped, blocked = list[ReleaseChange](), set[str](), list[str]()
+    for key, new in planned.plans.items():
         checkpoint()
-        old = former[key]
+        old = planned.former[key]
         old_path = path_of(old) if old else None
         new_path = path_of(new) if new else None
         current = read(new_path) if new_path else None
@@ -137,9 +153,9 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
             old = texts.with_new_values_of_unused(old, new, text)
         if old or new:
             releases.append(describe_change(old, new, current is not None))
-    _refuse_large(files, most, read)
+    _refuse_large(files, config.repo_settings.limits.file_bytes, read)
     releases.sort(key=lambda change: change.order)
-    return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked), now, former)
+    return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
 
 
 def _ledger_files(
@@ -180,7 +196,7 @@ def render_all(
     With ``keeps_late``, a release whose values take too long to compute keeps its file.
     """
     config, keys = world.config, all_keys(world)
-    files = manifests.base_files(config)
+    files = gitops.base_files(config)
     texts = _Texts(config, evaluate)
     collisions.refuse_shared_names(world, keys)  # one would overwrite the file of the other
     for key in keys:
@@ -195,7 +211,7 @@ def render_all(
                 raise
             if path in current:
                 files[path] = current[path]
-    return files | release_file.kept_charts(files, current, world)
+    return files | gitops.kept_charts(files, current, world)
 
 
 class _Texts:
@@ -213,7 +229,7 @@ class _Texts:
         if template in self._late:
             raise self._late[template]
         try:
-            return release_file.release_text(release, self._config, self._evaluate, current)
+            return gitops.release_text(release, self._config, self._evaluate, current)
         except OverLimit as error:
             self._late[template] = error
             raise
@@ -360,7 +376,7 @@ def _render_errors(
         if config.values_template(release.service) in late:
             continue
         try:
-            manifests.render(release, config, evaluate)
+            gitops.render(release, config, evaluate)
         except InvalidInput as error:
             errors.append(error)
             if isinstance(error, OverLimit):
@@ -432,7 +448,7 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
         try:
             release = plan(world, key)
             if release is not None:
-                manifests.render(release, world.config, evaluate)
+                gitops.render(release, world.config, evaluate)
         except InvalidInput as error:
             errors.append((key, error))
     if not errors:

@@ -8,41 +8,43 @@ after the remote got newer commits all call the same function.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import chain
+from functools import cache
 from typing import Literal, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
-from demandops.base.naming import Subject
+from demandops.connections.connection import ClientKey
 from demandops.decide import carriers, changeset, rollback, warnings
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.completing import (
     completed,
     notes_on_instances,
-    placed,
+    prepared,
     with_definitions,
     with_separate_instances,
 )
 from demandops.decide.booking import Drain, apply
-from demandops.decide.changeset import Changeset, FileReader, ReleaseChange
+from demandops.decide.changeset import Changeset, FileReader, PlannedChange, ReleaseChange
 from demandops.decide.checks import collisions, quotas, version_difference
+from demandops.decide.checks.version_difference import Difference
 from demandops.decide.placement import capacity, placement, relocation
 from demandops.decide.placement.candidates import NO_ROOM
+from demandops.decide.placement.capacity import Need
 from demandops.decide.planning.flows import flows_without_carrier
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
-from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, keys_of_claims
+from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
 from demandops.model.config.config import Config
-from demandops.model.demand.demand import Application, Decommission, Demand
+from demandops.model.demand.demand import Application, Demand
 from demandops.model.demand.goals import goal_field, read_goal
-from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger import ledger as ledgers
-from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World
+from demandops.model.ledger.ledger import Changes, World, claim_changes, ledger_of
 from demandops.model.ledger.records import Wait, WaitingDemand
+
+_Each = TypeVar("_Each")
+_Result = TypeVar("_Result")
 
 Stage = Literal["admitted", "booked"]
 Outcome = Literal["booked", "released", "restored", "unchanged", "waiting"]
@@ -127,8 +129,9 @@ def decide(
         now: when the demand was received, with time zone.
         on_stage: called when the demand is admitted and when it is booked, each at most once.
             Later checks may still refuse an admitted demand.
-        throttle: called if all other checks of admission find no fault, perhaps twice for one
-            demand. It is not called for a :class:`Decommission` and for the generator's own.
+        throttle: called if all other checks of admission find no fault, for one demand perhaps
+            with several nodes. It is not called for a :class:`Decommission` and for the
+            generator's own.
         checkpoint: called often while a demand that may add claims is decided, and raises
             :class:`OverBudget` to end the decision. It can only refuse a demand, never change what
             is decided.
@@ -139,53 +142,46 @@ def decide(
         InvalidInput: if a file of the state repo prevents the rendering of a valid demand.
     """
     demand = read_goal(goal, state.config.repo_settings.limits)
-    if demand.is_complete:
-        try:
-            return _carried_out(state, demand, now, read, on_stage)
-        except Refused as refused:
-            raise _refused(state, demand, refused.faults) from None
-    if not demand.adds_claims:  # what was booked must be released, however long that takes
+    # what was booked must be released, however long that takes
+    if demand.is_complete or not demand.adds_claims:
         checkpoint = _no_limit
-    throttled, told = list[Fault](), set[Stage]()
+    tell = cache(on_stage)  # once for each stage, because there may be several attempts
 
-    # who was throttled must not get another try on other nodes
-    def noted(demand: Demand, config: Config) -> list[Fault]:
-        throttled[:] = throttle(demand, config)
-        return throttled
+    def throttled(request: Demand) -> Demand:
+        if too_soon := tuple(throttle(request, state.config)):
+            raise _TooSoon(too_soon)
+        return request
 
-    def once(stage: Stage) -> None:
-        if stage not in told:
-            told.add(stage)
-            on_stage(stage)
+    def attempt(request: Demand, faults: Sequence[Fault] = ()) -> _Booked:
+        if not request.is_complete:
+            # in this order, because a demand with faults does not count against the limits
+            request = throttled(admitted(request, state, faults, checkpoint))
+        tell("admitted")
+        return _booked(state, request, now, read, checkpoint)
 
     try:
-        request = _admitted_or_waiting(state, demand, now, noted, checkpoint)
-        return _carried_out(state, request, now, read, once, checkpoint)
-    except OverBudget as spent:
-        raise _refused(state, demand, [_too_large(spent)]) from None
-    except Refused as refused:
-        faults = refused.faults
         try:
-            checkpoint()
-            # Look for nodes on which the demand is not refused. To try many nodes takes time, but
-            # only a demand that is refused on the nodes chosen first takes this time.
-            if (
-                not throttled
-                and all(each.code in _BY_NODE for each in faults)
-                and placement.needs_placement(
-                    defined := with_definitions(demand, state.config), state
-                )
-                and defined.adds_claims
-            ):
-                checkpoint()
-                with suppress(Refused):
-                    trials = _Trials(state, now, checkpoint)
-                    request = admit(state, demand, throttle, trials.succeeds, checkpoint)
-                    return _carried_out(state, request, now, read, once, checkpoint)
-        except OverBudget as spent:
-            # keep the faults of the first refusal: they tell the requester what to change
-            faults = (_too_large(spent), *faults)
-        raise _refused(state, demand, faults) from None
+            booked = _searched(state, demand, attempt, checkpoint)
+        except Refused as refused:
+            wait = _wait(state, demand, refused.faults, now, checkpoint)
+            if wait is None:
+                raise
+            throttled(demand)
+            booked = attempt(wait)
+        decision = _rendered(state, booked, read, checkpoint)
+    except OverBudget as spent:
+        raise _refused(state, demand, [fault("", str(spent), code="too-large")]) from None
+    except (_TooSoon, Refused) as refused:
+        raise _refused(state, demand, refused.faults) from None
+    tell("booked")
+    return decision
+
+
+class _TooSoon(Exception):
+    """Raised when a demand is throttled; who was throttled gets no try on other nodes."""
+
+    def __init__(self, faults: tuple[Fault, ...]) -> None:
+        self.faults = faults
 
 
 def _no_limit() -> None:
@@ -208,77 +204,63 @@ def _refused(state: State, demand: Demand, faults: Iterable[Fault]) -> Refused:
     return Refused(dict.fromkeys(told))  # a fault of the requesters is one of each item
 
 
-def _admitted_or_waiting(
-    state: State, demand: Demand, now: datetime, throttle: Throttle, checkpoint: Checkpoint
-) -> Demand:
-    """Return the completed demand, or its wait if it lacks only room and may wait."""
-    try:
-        return admit(state, demand, throttle, None, checkpoint)
-    except Refused as refused:
-        # the reference's action names no demand that could wait
-        if demand.operation != "put" or any(each.code != NO_ROOM for each in refused.faults):
-            raise
-        # a demand that holds claims keeps them when it is refused, so it cannot wait as well
-        if state.ledger.claims_of_demand(demand.demand):
-            raise
-        if strangers := list(permission.owner_faults(demand, state.ledger, state.config)):
-            raise Refused(strangers) from None
-        asked = with_separate_instances(demand, state.config)
-        if not placement.may_wait(asked, state, checkpoint):
-            raise
-        if faults := list(throttle(asked, state.config)):
-            raise Refused(faults) from None
-        # a demand that is sent again keeps its place among those that wait
-        before = state.ledger.waiting.get(demand.demand)
-        waiting = WaitingDemand(demand, before.since if before else now)
-        reasons = tuple(each.message for each in refused.faults)
-        who = waiting.requesters
-        return Wait("wait", demand.id, (), demand.demand, who, waiting=waiting, reasons=reasons)
+# ---- parse, complete, admit, place ----
+
+
+def _searched(
+    state: State,
+    demand: Demand,
+    attempt: Callable[[Demand, Sequence[Fault]], _Result],
+    checkpoint: Checkpoint,
+) -> _Result:
+    """Return what the attempt returns for the completed demand on the first nodes that do."""
+    if demand.is_complete:
+        return attempt(demand, ())
+    if faults := list(admission.size_faults(demand, state.config.repo_settings.limits)):
+        raise Refused(faults)
+    checkpoint()
+    request, unclear = prepared(demand, state)
+    return placement.search(
+        request, state, lambda placed, faults: attempt(placed, (*unclear, *faults)), checkpoint
+    )
+
+
+def admit(state: State, demand: Demand) -> Demand:
+    """Return the completed demand, or raise Refused with all faults against the configuration."""
+    return _searched(
+        state,
+        demand,
+        lambda request, faults: admitted(request, state, faults, _no_limit),
+        _no_limit,
+    )
 
 
 _ITEM = re.compile(r"(applications|connections)\[(\d+)\]")
 
 
-def admit(
-    state: State,
-    demand: Demand,
-    throttle: Throttle = lambda demand, config: (),
-    trial: placement.Trial | None = None,
-    checkpoint: Checkpoint = _no_limit,
+def admitted(
+    request: Demand, state: State, faults: Sequence[Fault], checkpoint: Checkpoint
 ) -> Demand:
-    """Return the completed demand, or raise Refused with all faults against the configuration.
-
-    If ``trial`` is given, a node is chosen only if ``trial`` accepts the demand with this node.
-    """
-    config = state.config
-    limits = config.repo_settings.limits
-    if faults := list(admission.size_faults(demand, limits)):
-        raise Refused(faults)
-    checkpoint()
-    request, faults = completed(demand, state, trial, checkpoint)
-    if isinstance(request, Decommission):
+    """Return the completed request; raise Refused with ``faults`` and all that admission finds."""
+    if request.is_complete:
         return request
+    request, config = completed(request, state, checkpoint), state.config
     # derived connections count as well
-    if large := list(admission.size_faults(request, limits)):
+    if large := list(admission.size_faults(request, config.repo_settings.limits)):
         raise Refused(large)
     checkpoint()
-    faults += _paced(admission.faults(request, config), checkpoint)
+    found = [*faults, *_paced(admission.faults(request, config), checkpoint)]
     for item in _paced(request.demanded, checkpoint):  # an access domain may have many rules
-        faults += permission.faults(replace(request, demanded=(item,)), config)
-    # last, because a demand with faults does not count against the limits of its requesters
-    faults = faults or list(throttle(request, config))
-    if faults:
+        found += permission.faults(replace(request, demanded=(item,)), config)
+    if found:
 
         def item_of(each: Fault) -> tuple[str, int]:
             match = _ITEM.match(each.field)
             return (match[1], int(match[2])) if match else ("", 0)
 
         # the faults of one application or connection are reported together
-        raise Refused(sorted(dict.fromkeys(faults), key=item_of))
+        raise Refused(sorted(dict.fromkeys(found), key=item_of))
     return request
-
-
-_Each = TypeVar("_Each")
 
 
 def _paced(items: Iterable[_Each], checkpoint: Checkpoint) -> Iterator[_Each]:
@@ -287,140 +269,56 @@ def _paced(items: Iterable[_Each], checkpoint: Checkpoint) -> Iterator[_Each]:
         yield item
 
 
-def _too_large(spent: OverBudget) -> Fault:
-    return fault("", str(spent), code="too-large")
+def _wait(
+    state: State, demand: Demand, faults: Sequence[Fault], now: datetime, checkpoint: Checkpoint
+) -> Wait | None:
+    """Return the wait of a refused demand if it lacks only room and may wait."""
+    # the reference's action names no demand that could wait
+    if demand.operation != "put" or any(each.code != NO_ROOM for each in faults):
+        return None
+    # a demand that holds claims keeps them when it is refused, so it cannot wait as well
+    if state.ledger.claims_of_demand(demand.demand):
+        return None
+    if strangers := list(permission.owner_faults(demand, state.ledger, state.config)):
+        raise Refused(strangers)
+    asked = with_separate_instances(demand, state.config)
+    if not placement.may_wait(asked, state, checkpoint):
+        return None
+    before = state.ledger.waiting.get(demand.demand)
+    # a demand that is sent again keeps its place among those that wait
+    waiting = WaitingDemand(demand, before.since if before else now)
+    reasons, who = tuple(each.message for each in faults), waiting.requesters
+    return Wait("wait", demand.id, (), demand.demand, who, waiting=waiting, reasons=reasons)
 
 
-def _once(*texts: str) -> tuple[str, ...]:
-    return tuple(filter(None, dict.fromkeys(texts)))
+# ---- book and plan ----
 
 
-# The codes of faults that might not occur if other nodes were chosen for the demand
-_BY_NODE = frozenset(
-    ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
-)
+@dataclass(frozen=True, slots=True)
+class _Booked:
+    """A request that is booked and planned, and refused by nothing; it is not rendered yet."""
 
-
-# How many bookings one demand, or one drain of a node, may try while nodes are looked for. Each
-# trial books all that is placed so far. So the trials of one demand together may also book no more
-# items than the largest demand may list.
-MOST_TRIALS = 64
-
-
-class _Trials:
-    def __init__(self, state: State, now: datetime, checkpoint: Checkpoint) -> None:
-        self._state, self._now, self._checkpoint = state, now, checkpoint
-        self._tried = self._items = 0
-
-    def succeeds(self, request: Demand) -> bool:
-        """Return whether a request, which names a node for each application, can be booked."""
-        self._tried += 1
-        self._items += admission.items_of(request)
-        most = self._state.config.repo_settings.limits.demand_items
-        if self._tried > MOST_TRIALS or self._items > most:
-            raise OverBudget(
-                "too many nodes would have to be tried for this demand; name a node for each "
-                "application, or split the demand"
-            )
-        config = self._state.config
-        request = placed(request, self._state, self._checkpoint)
-        if next(admission.faults(request, config), None):
-            return False
-        for item in _paced(request.demanded, self._checkpoint):
-            if next(permission.faults(replace(request, demanded=(item,)), config), None):
-                return False
-        try:
-            _booked(self._state, request, self._now, self._checkpoint)
-        except Refused:
-            return False
-        return True
-
-
-def _carried_out(
-    state: State,
-    request: Demand,
-    now: datetime,
-    read: FileReader,
-    on_stage: Callable[[Stage], None] = lambda stage: None,
-    checkpoint: Checkpoint = _no_limit,
-) -> Decision:
-    """Return the decision on a demand that is admitted: book, plan and render it."""
-    config = state.config
-    if isinstance(request, Drain):
-        request = relocation.with_moves(request, state, state.usage(), state.names(), MOST_TRIALS)
-    if isinstance(request, Restoration):
-        # claims of before the upgrade may carry a route twice
-        united, _ = carriers.with_one_carrier(ledgers.ledger_of(request.claims))
-        request = replace(request, claims=tuple(united))
-        request = relocation.with_restored_moves(request, state)
-        faults = list(rollback.faults(request, state))
-        if faults:
-            raise Refused(faults)
-    on_stage("admitted")
-    after, changes, keys = _booked(state, request, now, checkpoint)
-    if taken := list(collisions.faults_in_files(request, changes, read)):
-        raise Refused(taken)
-    rendered = changeset.build_changeset(
-        state,
-        after,
-        changes,
-        keys,
-        state.evaluate,
-        read,
-        state.plans,
-        keeps_late=request.operation not in _OUTCOMES,  # a release waits for no template
-        checkpoint=checkpoint,
-    )
-    differing = list(
-        version_difference.differences(request, state, after, changes.claims, rendered.plans)
-    )
-    refused = [difference.fault for difference in differing if difference.is_refused]
-    grown = capacity.growth(rendered.former, rendered.plans, config)
-    # a drain was tried on its nodes already, and what releases claims makes room
-    if request.adds_claims or isinstance(request, Restoration):
-        refused = refused or list(capacity.faults(state.usage(), grown, config))
-    if refused:
-        raise Refused(refused)
-    checkpoint()
-    after = state.followed_by(after.ledger, rendered, state.usage().plus(grown))
-    checkpoint()
-    on_stage("booked")
-    outcome: Outcome = "unchanged"
-    if changes.claims or changes.waiting or isinstance(request, Wait):
-        outcome = _OUTCOMES.get(request.operation, "released")
-    return Decision(
-        request=request,
-        outcome=outcome,
-        state=after,
-        changes=changes,
-        files=rendered.files if changes.claims or changes.waiting else {},
-        releases=rendered.releases,
-        # a demand may list one thing twice, and several releases may have one reason
-        warnings=_once(
-            *notes_on(request, state, after, changes, rendered),
-            *(difference.warning() for difference in differing),
-        ),
-        approval=_once(
-            *permission.approval_reasons(
-                request, ((c.before, c.after) for c in changes.claims), config
-            ),
-            *(difference.approval_reason() for difference in differing),
-        ),
-        overrides=rendered.overrides,
-        awaited=any(amount < 0 for amount in grown.values())
-        # a demand that waits for room for an application runs wherever another demand books it
-        or any(
-            subject in changes.subjects()
-            for waiting in state.ledger.waiting.values()
-            if waiting.demand != request.demand
-            for subject in waiting.put.subjects()
-        ),
-    )
+    request: Demand
+    after: State
+    changes: Changes
+    planned: PlannedChange
+    differing: Sequence[Difference]
+    grown: Mapping[Need, int]
 
 
 def _booked(
-    state: State, request: Demand, now: datetime, checkpoint: Checkpoint
-) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
+    state: State, request: Demand, now: datetime, read: FileReader, checkpoint: Checkpoint
+) -> _Booked:
+    if isinstance(request, Drain):
+        most = placement.MOST_ATTEMPTS
+        request = relocation.with_moves(request, state, state.usage(), state.names(), most)
+    if isinstance(request, Restoration):
+        # claims of before the upgrade may carry a route twice
+        united, _ = carriers.with_one_carrier(ledger_of(request.claims))
+        request = replace(request, claims=tuple(united))
+        request = relocation.with_restored_moves(request, state)
+        if faults := list(rollback.faults(request, state)):
+            raise Refused(faults)
     checkpoint()
     if strangers := list(permission.owner_faults(request, state.ledger, state.config)):
         raise Refused(strangers)
@@ -434,7 +332,7 @@ def _booked(
     if not isinstance(request, Restoration):
         ledger, idle = carriers.without_idle_routes(ledger, state.config, changes.claims)
         idle += [change.key for change in changes.claims]
-        changes = replace(changes, claims=ledgers.claim_changes(state.ledger, ledger, idle))
+        changes = replace(changes, claims=claim_changes(state.ledger, ledger, idle))
     after = replace(state, ledger=ledger)
     checkpoint()
     refusals = list(quotas.denial_faults(request, after, changes))
@@ -446,9 +344,7 @@ def _booked(
     changed = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
     ledger, kept_keys = update_kept_claims(state.ledger, after, touched, now)
-    changes = replace(
-        changes, claims=ledgers.claim_changes(state.ledger, ledger, [*changed, *kept_keys])
-    )
+    changes = replace(changes, claims=claim_changes(state.ledger, ledger, [*changed, *kept_keys]))
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
@@ -458,9 +354,76 @@ def _booked(
     )
     for change in changes.claims if isinstance(request, Restoration) else ():
         clashes += collisions.faults_of_claim(change.after, state, after) if change.after else ()
+    clashes = clashes or list(collisions.faults_in_files(request, changes, read))
     if clashes:
         raise Refused(clashes)
-    return after, changes, keys
+    # a service whose node is to be chosen later has no release yet
+    chosen = [key for key in keys if isinstance(key, ClientKey) or key.node]
+    planned = changeset.plan_change(state, after, changes, chosen, read, state.plans, checkpoint)
+    differing = list(
+        version_difference.differences(request, state, after, changes.claims, planned.plans)
+    )
+    if refused := [difference.fault for difference in differing if difference.is_refused]:
+        raise Refused(refused)
+    grown = capacity.growth(planned.former, planned.plans, state.config)
+    # a drain was tried on its nodes already, and what releases claims makes room
+    if request.adds_claims or isinstance(request, Restoration):
+        capacity.refuse_excess(state.usage(), grown, state.config)
+    return _Booked(request, after, changes, planned, differing, grown)
+
+
+# ---- render ----
+
+
+def _rendered(state: State, booked: _Booked, read: FileReader, checkpoint: Checkpoint) -> Decision:
+    request, changes, config = booked.request, booked.changes, state.config
+    rendered = changeset.render_change(
+        booked.planned,
+        config,
+        state.evaluate,
+        read,
+        keeps_late=request.operation not in _OUTCOMES,  # a release waits for no template
+        checkpoint=checkpoint,
+    )
+    checkpoint()
+    usage = state.usage().plus(booked.grown)
+    after = state.followed_by(booked.after.ledger, booked.planned, usage)
+    checkpoint()
+    outcome: Outcome = "unchanged"
+    if changes.claims or changes.waiting or isinstance(request, Wait):
+        outcome = _OUTCOMES.get(request.operation, "released")
+    return Decision(
+        request=request,
+        outcome=outcome,
+        state=after,
+        changes=changes,
+        files=rendered.files if changes.claims or changes.waiting else {},
+        releases=rendered.releases,
+        # a demand may list one thing twice, and several releases may have one reason
+        warnings=_once(
+            *notes_on(request, state, after, changes, rendered),
+            *(difference.warning() for difference in booked.differing),
+        ),
+        approval=_once(
+            *permission.approval_reasons(
+                request, ((c.before, c.after) for c in changes.claims), config
+            ),
+            *(difference.approval_reason() for difference in booked.differing),
+        ),
+        overrides=rendered.overrides,
+        awaited=any(amount < 0 for amount in booked.grown.values())
+        # a demand that waits for room for an application runs wherever another demand books it
+        or any(
+            subject in changes.subjects()
+            for waiting in state.ledger.waiting.values()
+            if waiting.demand != request.demand
+            for subject in waiting.put.subjects()
+        ),
+    )
+
+
+def _once(*texts: str) -> tuple[str, ...]:
+    return tuple(filter(None, dict.fromkeys(texts)))
 
 
 # ---- notes for the requester, in addition to the outcome ----
@@ -487,57 +450,11 @@ def notes_on(
                 if change.after.connection.topics[index] not in former:
                     yield f"{words}; a subscriber gets the messages of both"
     yield from warnings.notes(request, before)
+    yield from warnings.unheld_output_notes(request, after)
+    yield from warnings.lost_output_notes(changes, after)
     yield from rendered.blocked
     if isinstance(request, Drain):
         yield from request.stays
     if isinstance(request, Wait):
         yield from request.reasons
     yield from quotas.warnings(request, after)
-
-
-# ---- claims that a person edits in the ledger ----
-
-
-def changeset_of_edit(
-    state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
-) -> changeset.Changeset:
-    old = replace(state, ledger=before)
-    keys = affected_keys(old, state, ledgers.changes_on(before, state.ledger, subjects))
-    # a template that takes too long is no fault of the claim, so its release keeps its file
-    return changeset.build_changeset(
-        old, state, Changes(), keys, state.evaluate, read, keeps_late=True
-    )
-
-
-def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
-    """Yield the faults of claims that a person wrote, each located in the claim's file."""
-    for change in changes:
-        claim = change.after
-        if claim is None:
-            continue
-        # an edit that only takes requesters away has the effect of a release, which is allowed
-        if (
-            (old := change.before)
-            and replace(claim, requesters=old.requesters) == old
-            and {*claim.requesters} <= {*old.requesters}
-        ):
-            continue
-        wanted, config = rollback.request_for(claim), after.config
-        malformed = list(admission.faults(wanted, config))
-        allowed = chain(
-            permission.faults(wanted, config),
-            quotas.quota_faults(before, after, Changes((change,))),
-        )
-        for each in malformed or allowed:
-            yield each.within(claim_files.path_of(claim.key))
-        yield from collisions.faults_of_claim(claim, before, after)
-        keys, changed = keys_of_claims(after, [claim]), Changes((change,))
-        faults = list(collisions.name_faults(wanted, before, after, keys, changed, after.names()))
-        without = replace(after, ledger=after.ledger.replace(change.key, change.before))
-        with suppress(Refused):  # other checks report a claim that cannot be planned
-            grown = capacity.growth_by(without, after, [change])
-            # only growth is a fault: the nodes may be full because of other claims
-            usage = after.usage().plus({need: -amount for need, amount in grown.items()})
-            faults += capacity.faults(usage, grown, config)
-        for each in faults:
-            yield each.within(claim_files.path_of(claim.key))

@@ -45,14 +45,14 @@ class State(World):
         object.__setattr__(self, "_names", names)
         return names
 
-    def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
+    def followed_by(self, ledger: Ledger, planned: changeset.PlannedChange, usage: Usage) -> State:
         plans = self.plans
-        for key, release in rendered.plans.items():
+        for key, release in planned.plans.items():
             plans = plans.insert(key, release) if release else plans.discard(key)
         state = replace(self, ledger=ledger)
         object.__setattr__(state, "plans", plans)
         object.__setattr__(state, "_usage", usage)
-        state._follow_names(self, rendered.plans.keys())
+        state._follow_names(self, planned.plans.keys())
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:

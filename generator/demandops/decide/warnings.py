@@ -13,18 +13,20 @@ from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, needed_access
 from demandops.decide.booking import Drain
-from demandops.decide.checks.collisions import all_names
+from demandops.decide.checks.collisions import all_names, publishers
 from demandops.decide.placement.candidates import lacks, requirement_of, unmet
 from demandops.decide.placement.capacity import overcommitted, whole_usage
 from demandops.decide.placement.relocation import following_overrides, with_moves
-from demandops.decide.planning.flows import flows_without_carrier
+from demandops.decide.planning.flows import flows_without_carrier, topics_of_origin
 from demandops.decide.planning.overrides import without_suspended
+from demandops.decide.planning.release_keys import claims_needing
 from demandops.model.config.appdef import ignored_fields
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.policy import AccessDomain, matches
-from demandops.model.demand.demand import Application, Demand
+from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.ledger import World
+from demandops.model.ledger.claim import ClaimKey, demand_id
+from demandops.model.ledger.ledger import Changes, World
 from demandops.templating import charts
 
 # ---- missing inputs: topics that applications read or deliver, but that do not arrive ----
@@ -65,6 +67,9 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
         if topic.source not in config.nodes:
             where = f"'{topic.source}' is not in the inventory"
             yield f"{role} {topic.topic} does not arrive: {where}"
+        elif topic.application and not any(publishers(active, topic.source, topic.topic)):
+            maker = f"application '{topic.application}' of '{topic.source}'"
+            yield f"{role} {topic.topic} does not arrive: {maker} does not make it"
     for flow in flows_without_carrier(config, app, active.ledger):
         if flow.sender in config.nodes:
             yield (
@@ -78,6 +83,70 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
             yield (
                 f"{delivery.output} is no longer delivered to '{delivery.node}': the application "
                 f"definition '{app.appdef}' has no such output"
+            )
+
+
+# ---- outputs of applications that others read by the names of the topics alone ----
+#
+# The demand of such a reader does not hold the application, and is not asked when it ends.
+
+
+def unheld_output_warnings(world: World) -> Iterator[Fault]:
+    for claim in sorted(world.ledger, key=lambda claim: claim_files.path_of(claim.key)):
+        for note in _unheld_outputs(claim.held, claim.demand, world):
+            yield fault("", note).within(claim_files.path_of(claim.key))
+
+
+def unheld_output_notes(request: Demand, after: World) -> Iterator[str]:
+    for item in request.demanded if request.adds_claims else ():
+        demand = request.demand or demand_id(request.id, item.requesters)
+        yield from _unheld_outputs(item.held, demand, after)
+
+
+def _unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
+    if not isinstance(held, Application) or held.held_for:
+        return
+    services = (each for services in world.config.services.values() for each in services.values())
+    patterns = {re.escape(each) for service in services for each in service.outputs.values()}
+    could_be_output = re.compile("|".join(patterns).replace(r"\{instance\}", ".+")).fullmatch
+    told = set[tuple[str, str]]()
+    for _, input in held.all_inputs():
+        if input.application or not could_be_output(input.topic):
+            continue
+        for key, output in publishers(world, input.source, input.topic):
+            claims = claims_needing(world, key)
+            maker = claims[0].subject.id
+            # a service may make thousands of topics, which are told once
+            if any(claim.demand == demand for claim in claims) or (maker, output) in told:
+                continue
+            told.add((maker, output))
+            yield (
+                f"application '{held.id}': {input.topic} of '{input.source}' is an output of "
+                f"application '{maker}', which may end before this demand; a Demand that names "
+                f"{{application: {maker}, output: {output}}} instead of the topic holds it"
+            )
+
+
+def lost_output_notes(changes: Changes, after: World) -> Iterator[str]:
+    """Yield who still reads the outputs that are no longer made after these changes."""
+    for change in changes.claims:
+        if change.before is None or not change.before.is_on_application or change.only_renews:
+            continue
+        app, lost = change.before.application, dict[ClaimKey, str]()
+        services = after.config.services.get(app.appdef, {}).values()
+        for output in (
+            f"{service.name}.{name}" for service in services for name in service.outputs
+        ):
+            for made in topics_of_origin(after.config, app, output):
+                place = made.node, made.topic.topic
+                reading = [claim.key for claim in after.ledger.each_reading(*place)]
+                if reading and not any(publishers(after, *place)):
+                    what = f"{made.topic.topic} of '{made.node}' ({output})"
+                    lost = dict.fromkeys(reading, what) | lost
+        for key in sorted(lost, key=str):
+            yield (
+                f"{key.subject} of demand '{key.demand}' still reads {lost[key]}, which "
+                f"application '{app.id}' no longer makes"
             )
 
 

@@ -6,19 +6,25 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
+from itertools import dropwhile, takewhile
 from typing import Any
 
 from demandops.base import naming, strict_yaml
-from demandops.base.errors import InvalidInput
+from demandops.base.errors import InvalidInput, Refused
 from demandops.base.settings import MAIN_BRANCH
-from demandops.model.config.config import Config
+from demandops.connections.connection import UNSUPPORTED, Client
+from demandops.model.config.config import IMAGES_FILE, Config
 from demandops.model.config.inventory import NODE_LABEL
+from demandops.model.config.override import Override, format_time
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ChartSource
 from demandops.model.config.repo_settings import RepoSettings
+from demandops.model.ledger.ledger import World
 from demandops.model.release import Release, ServiceRelease
 from demandops.templating import engine
+from demandops.templating.values import Evaluate, ValuesTask
 
 # ---- the paths of generated files, the same for both controllers ----
 #
@@ -58,6 +64,225 @@ def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
     for cluster, domain in domains_in_use(config):
         domains.setdefault(cluster, []).append(domain)
     return domains
+
+
+# ---- the file of a release: comment lines that name the overrides, then its manifests ----
+#
+# A ``hold`` override keeps the body of a file byte for byte. Only the comments above the body may
+# change. These comments still name the overrides that shaped the body when the hold started.
+
+_START = "# override overrides/"
+# these effects change only a release's comments, which are updated even in a held file
+_OUTSIDE_BODY = frozenset({"hold", "keep"})
+_UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
+_CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
+
+
+def release_text(release: Release, config: Config, evaluate: Evaluate, current: str | None) -> str:
+    outside, of_body = list[str](), list[str]()
+    for override, effects in release.shaping.by:
+        is_outside = release.shaping.held and _OUTSIDE_BODY & {*effects}
+        (outside if is_outside else of_body).append(override_comment(override, effects))
+    if current is None or not release.shaping.held:
+        comments, body = [*outside, *of_body], render(release, config, evaluate)
+    else:
+        lines = current.splitlines(keepends=True)
+        body = "".join(dropwhile(lambda line: line.startswith(_START), lines))
+        # overrides that shaped the body may have ended since the hold started; their comments stay
+        above = takewhile(lambda line: line.startswith(_START), lines)
+        comments = [*outside, *(c.rstrip("\n") for c in above if not _UPDATED_COMMENT.match(c))]
+    return "".join(f"{comment}\n" for comment in comments) + body
+
+
+def override_comment(override: Override, effects: tuple[str, ...]) -> str:
+    until = f"until {format_time(override.end)}; " if override.end else ""
+    return (
+        f"# override {override.path}: {', '.join(effects)}; priority {override.priority}; {until}"
+        f"owner {override.owner}; reason: {override.reason}"
+    )
+
+
+def render(release: Release, config: Config, evaluate: Evaluate) -> str:
+    """Return the manifests of a release as text; raise Refused or InvalidInput if not possible.
+
+    Helm values and the plain manifests of connections are the same for Flux and Argo CD.
+    """
+    if not isinstance(release, ServiceRelease):
+        return render_connection(release, config)
+    values, chart, repository = (
+        values_of(release, config, evaluate),
+        release.chart,
+        config.repo_settings,
+    )
+    if repository.gitops == "argocd":
+        return engine.text(
+            "argocd/release.yaml.j2",
+            release=release,
+            chart=chart,
+            values=values,
+            project=project_of(release.domain, repository),
+            repository=repository,
+            branch=MAIN_BRANCH,
+            server=IN_CLUSTER,
+        )
+    return engine.text(
+        "flux/release.yaml.j2",
+        release=release,
+        chart_kind="OCIRepository" if chart.oci else "HelmChart",
+        chart_name=chart_object(release.service.chart, chart),
+        values=values,
+    )
+
+
+# ---- the Helm values of a service: what its template renders to, checked against the chart ----
+#
+# The variables that the template gets are the interface of application definitions
+# (docs/appdef.md). Requesters are not among these variables.
+
+
+def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> dict[str, Any]:
+    """Return the Helm values of a service, with the patches of overrides merged in.
+
+    InvalidInput names the template, the schema or the override at fault.
+    """
+    template = config.values_template(release.service)
+    if release.autoscaler and release.autoscaler.max == 0:
+        by = [each.path for each, effects in release.shaping.by if "replicas" in effects]
+        # seen on a cluster: the 0 stayed when the override ended, as no autoscaler starts from 0
+        message = (
+            "is 0, but an autoscaler keeps at least one replica; to run none, use 'deny' instead"
+        )
+        raise InvalidInput.at("replicas", message, file=by[-1])
+    task = ValuesTask(
+        template, _variables(release, config), release.chart.folder, tuple(release.shaping.patches)
+    )
+    try:
+        return evaluate(config.files, task)
+    except InvalidInput as error:
+        changing = {"version", "images", "replicas", "node"}
+        files = [override.path for override, effects in release.shaping.by if changing & {*effects}]
+        if not files:
+            raise
+        note = f" (overrides change what the template gets, so check {' and '.join(files)} too)"
+        faults = (
+            replace(fault, message=fault.message + note) if fault.file == template else fault
+            for fault in error.faults
+        )
+        raise type(error)(faults) from None
+
+
+def _variables(release: ServiceRelease, config: Config) -> dict[str, object]:
+    node = release.node
+    variables: dict[str, object] = {
+        "release": release.name,
+        "service": release.key.service,
+        "node": {
+            "id": node.id,
+            "selector": node.labels(),
+            "tolerations": [item.model_dump(exclude_defaults=True) for item in node.tolerations],
+            "image_pull_secrets": list(node.image_pull_secrets),
+            "host_network": node.host_network,
+            "ros": {
+                "domain_id": node.ros.domain_id,
+                "rmw": "" if node.ros.rmw == "image" else node.ros.rmw,
+            },
+        },
+        "inputs": {
+            role: [
+                {"topic": topic.topic, "source": topic.source, "type": topic.type}
+                for topic in topics
+            ]
+            for role, topics in release.inputs.items()
+        },
+        "topics": {
+            role: list(dict.fromkeys(topic.topic for topic in topics))
+            for role, topics in release.inputs.items()
+        },
+        "outputs": dict(release.outputs),
+        "parameters": dict(release.parameters),
+        "requests": dict(release.service.requests),
+        "images": {name: release.image(name, config).parts() for name in release.service.images},
+    }
+    # Never both. A template that knows only ``replicas`` must fail, because the GitOps controller
+    # would set back what the autoscaler writes.
+    if release.autoscaler:
+        variables["autoscaler"] = release.autoscaler.values()
+    else:
+        variables["replicas"] = release.replicas
+    if release.key.application is not None:
+        variables["application"] = release.key.application
+    elif release.key.source is not None:
+        variables |= {"source": release.key.source, "source_topic": release.key.topic}
+    return variables
+
+
+# ---- the file of a communication client: a Deployment, and a ConfigMap with its configuration ----
+#
+# Each connection type has a template and a schema in ``templates/connections/<type>/``. The schema
+# lists the fields that the client program reads; tests compare configurations with it.
+
+
+def render_connection(client: Client, config: Config) -> str:
+    """Return the manifests of a client as one YAML text.
+
+    Raises:
+        InvalidInput: if an override's patch gives no valid settings.
+        Refused: if the registry has no image for the client.
+    """
+    kind, node = client.type, client.node
+    if kind.image not in config.images:
+        message = (
+            f"'{kind.image}' is in use, but not in {config.place_of(IMAGES_FILE)}; add it there"
+        )
+        raise Refused.at("images", message, code=UNSUPPORTED)
+    configuration, settings = client.configuration(), client.settings(config)
+    # A client reads these fields only at its start. Their checksum is an annotation of the pod, so
+    # that a change of them restarts the pod, and a change of other fields does not.
+    at_start = client.written(client.read_at_start(configuration))
+    return engine.text(
+        f"connections/{kind.word}/client.yaml.j2",
+        client=client,
+        configuration=client.written(configuration),
+        checksum=hashlib.sha256(at_start.encode()).hexdigest(),
+        node=node,
+        selector=node.labels(),
+        tolerations=[item.model_dump(exclude_defaults=True) for item in node.tolerations],
+        settings=settings,
+        env=client.environment(settings) | settings.env,
+        probes={
+            f"{name}Probe": probe
+            for name in ("startup", "readiness", "liveness")
+            if (probe := getattr(settings, f"{name}_probe"))
+        },
+        resources=settings.resources.model_dump(),
+        host_network=node.host_network if settings.host_network is None else settings.host_network,
+        image=client.shaping.image(kind.image, config.images[kind.image]).reference(),
+    )
+
+
+# ---- the other files: of domains and clusters, and chart sources ----
+
+
+def base_files(config: Config) -> dict[str, str]:
+    # Each access domain of a cluster has a placeholder file, because Git keeps no empty folder.
+    # Without the folder, Flux and Argo CD would fail instead of removing what is not demanded.
+    if config.repo_settings.gitops == "argocd":
+        return argocd_base_files(config)
+    return flux_base_files(config)
+
+
+def kept_charts(
+    files: Mapping[str, str], current: Mapping[str, str], world: World
+) -> dict[str, str]:
+    """Return the chart sources in ``current`` that stay for releases that are held."""
+    if not any(override.hold for override in world.overrides):
+        return {}
+    # not that of a chart in a folder of the state repo: it would fetch the folder's newest version
+    return {
+        path: text
+        for path, text in current.items()
+        if _CHART.fullmatch(path) and path not in files and "kind: GitRepository" not in text
+    }
 
 
 # ---- the rule by which a cluster lets pods of an access domain run only on the domain's nodes ----
@@ -167,17 +392,6 @@ def digest_in(text: str) -> str:
 # ledger, unless the topics, parameters or replicas of the service change with it.
 
 
-def flux_manifests(release: ServiceRelease, values: Mapping[str, Any]) -> str:
-    chart = release.chart
-    return engine.text(
-        "flux/release.yaml.j2",
-        release=release,
-        chart_kind="OCIRepository" if chart.oci else "HelmChart",
-        chart_name=chart_object(release.service.chart, chart),
-        values=values,
-    )
-
-
 def chart_object(name: str, chart: ChartSource) -> str:
     # the OCIRepository or HelmChart that fetches this version of a chart
     return f"{name}-{chart.version}".lower()
@@ -223,21 +437,6 @@ IN_CLUSTER = "https://kubernetes.default.svc"
 def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
     # the domain's AppProject, and the Application of the domain's folder
     return f"{repository.source}-{domain.name}"
-
-
-def argocd_manifests(
-    release: ServiceRelease, values: Mapping[str, Any], repository: RepoSettings
-) -> str:
-    return engine.text(
-        "argocd/release.yaml.j2",
-        release=release,
-        chart=release.chart,
-        values=values,
-        project=project_of(release.domain, repository),
-        repository=repository,
-        branch=MAIN_BRANCH,
-        server=IN_CLUSTER,
-    )
 
 
 def argocd_base_files(config: Config) -> dict[str, str]:

@@ -18,11 +18,9 @@ from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.config.load import load
 from demandops.model.config.repo_settings import ROOT_FILE, as_git_url
 from demandops.model.ledger.ledger import Ledger
-from demandops.repo.git import signing
-from demandops.repo.git import tree as trees
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.signing import Signer
-from demandops.repo.history import commit_log, commit_message
+from demandops.repo.history import commit_message
 from demandops.templating.evaluator import EVALUATE
 
 # ---- the files: the skeleton, the appdefs and the rendered files ----
@@ -141,12 +139,12 @@ def _write(
     repo.config["receive.fsckObjects"] = True  # refuse objects that libgit2 cannot read
     repo.config["gc.auto"] = 0  # because the generator joins the packs in the background
     objects = NewObjects(repo)
-    tree = trees.write(objects, None, content)
+    tree = objects.add_tree(None, content)
     why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
     trailers = [("Operation", "init"), ("Render-Version", str(RENDER_VERSION))]
-    text = commit_log.compose([["Create the state repo"], [why]], trailers)
+    text = commit_message.compose([["Create the state repo"], [why]], trailers)
     signature = commit_message.generator_signature(now)
-    commit = signing.create_commit(objects, signer, (signature, signature), text, tree, [])
+    commit = objects.add_commit(signer, (signature, signature), text, tree, [])
     with objects.packed(commit):
         repo.references.create(f"refs/heads/{MAIN_BRANCH}", commit)
     if not bare:

@@ -24,10 +24,10 @@ from demandops.repo import verification
 from demandops.repo.git import tree as trees
 from demandops.repo.git.local_repository import LastFetch, connect, is_url
 from demandops.repo.git.repository import StateRepository, access_error, reading
-from demandops.repo.history import commit_log, commit_message, revisions
-from demandops.repo.history.commit_log import LogEntry, PathHistory
-from demandops.repo.history.commit_message import Person
-from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
+from demandops.repo.history import commit_log, revisions
+from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
+from demandops.repo.load import last_valid_config, ledger_files
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.verification import Verdict
 from demandops.repo.write.journal import Slot
@@ -91,7 +91,7 @@ class Reader:
     ) -> Snapshot:
         commit = self.commit(revision)
         try:
-            return state_in_effect.snapshot_at(self._objects, commit, progress)
+            return snapshots.snapshot_at(self._objects, commit, progress)
         except InvalidInput as error:
             raise InvalidInput(with_lines(error.faults, self.file_reader(commit))) from None
 
@@ -102,13 +102,13 @@ class Reader:
         try:
             return self.snapshot(revision, progress)
         except InvalidInput:
-            return state_in_effect.state_at(self._objects, self.commit(revision), progress)
+            return snapshots.state_at(self._objects, self.commit(revision), progress)
 
     def snapshot_after(self, before: Snapshot) -> Snapshot:
-        is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
+        is_recorded = snapshots.record_at(self._objects, self._tip).first("In-Force")
         if before.problems or is_recorded:
             return self.last_valid_snapshot(str(self._tip))
-        return state_in_effect.state_after(self._objects, before, self._tip)
+        return snapshots.state_after(self._objects, before, self._tip)
 
     def problems(self, revision: str | None = None) -> tuple[last_valid_config.Problem, ...]:
         read = self.file_reader(revision)
@@ -248,7 +248,7 @@ class Reader:
         return ledger_files.restoration(self._objects, rollback)
 
     def operator(self) -> Person:
-        return commit_message.operator(self._objects.path)
+        return commit_log.operator(self._objects.path)
 
 
 @contextmanager

@@ -18,8 +18,7 @@ from demandops.base.runtime import REAL
 from demandops.base.settings import LEDGER_API_VERSION, RENDER_VERSION
 from demandops.decide.carriers import with_one_carrier
 from demandops.decide.changeset import planned_releases
-from demandops.decide.decision import faults_of_edit
-from demandops.decide.placement.relocation import changed_claim_files, update_ledger
+from demandops.decide.edits import changed_claim_files, faults_of_edit, update_ledger
 from demandops.decide.planning.flows import with_booked_topics_marked
 from demandops.decide.state import State
 from demandops.model.config.appdef import without_ignored_fields
@@ -36,7 +35,7 @@ from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import commit_log, commit_message
-from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
+from demandops.repo.load import last_valid_config, ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress
 from demandops.repo.write.commit_batch import CommitBatch
@@ -93,7 +92,7 @@ def upgrade(
             planned, batch, state, keys = _plan(repository, request, now, progress)
             if not planned.files:
                 return planned
-            who = commit_message.operator(repository.objects.path)
+            who = commit_log.operator(repository.objects.path)
             author = commit_message.signature(who.name, who.email, now)
             text = _message(planned, keys)
             commit = batch.commit_files(planned.files, state, text, author, now)
@@ -121,7 +120,7 @@ def _plan(
     config = load(by_people)
     state = State(config, snapshot.state.ledger, EVALUATE)
     # people may have edited since the state in effect; their edits are checked and applied too
-    start = state_in_effect.start_at(objects, tip)
+    start = snapshots.start_at(objects, tip)
     edits = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, start.state.ledger)
     refused = list(faults_of_edit(start.state, state, edits))
     if refused:
@@ -217,7 +216,7 @@ def _message(upgrade: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         ("From-Render-Version", str(old.render_version)),
         ("From-Gitops", old.gitops if upgrade.switches else ""),
         ("Gitops", new.gitops),
-        *commit_message.override_trailers(commit_message.keep_override_paths(keys)),
+        *commit_message.override_trailers((), keys),
         *commit_message.demand_trailers(keys),
         ("Render-Version", str(new.render_version)),
     ]
@@ -227,4 +226,4 @@ def _message(upgrade: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         [f"Why: `demandops upgrade` renders everything {why}."],
         ["Files written or removed:", *files],
     ]
-    return commit_log.compose(paragraphs, trailers)
+    return commit_message.compose(paragraphs, trailers)

@@ -26,12 +26,14 @@ from demandops.model.ledger import records
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 from demandops.model.ledger.ledger import ClaimChange, World
 from demandops.model.release import Release
-from demandops.render import manifests, release_file
+from demandops.render import gitops
 from demandops.render.gitops import path_of
 from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
-from demandops.repo.history.commit_log import PROPOSAL, LogEntry, entry_of
-from demandops.repo.load import ledger_files, state_in_effect
+from demandops.repo.history.commit_log import LogEntry, entry_of
+from demandops.repo.history.commit_message import PROPOSAL
+from demandops.repo.load import ledger_files
+from demandops.repo.load import snapshot as snapshots
 
 # ---- the files that a commit of the generator changed, but was not allowed to change ----
 #
@@ -147,7 +149,7 @@ class _Proof:
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         # with an override that sets ``hold``: such a file's text depends on the parent commit
         self._held: dict[ReleaseKey, Release] = {}
-        base_files = manifests.base_files(state.config)
+        base_files = gitops.base_files(state.config)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
         self._committed = _generated_files(commit.tree)
         self._render(all_keys(state))
@@ -193,9 +195,7 @@ class _Proof:
     def _rendered(self, release: Release, before: Tree | None) -> tuple[str, Oid]:
         path, state = path_of(release), self.state
         current = trees.read_text(before, path)
-        return path, _blob(
-            release_file.release_text(release, state.config, state.evaluate, current)
-        )
+        return path, _blob(gitops.release_text(release, state.config, state.evaluate, current))
 
     def differing(self) -> tuple[str, ...]:
         wanted = self._undemanded | dict(self._planned.values())
@@ -206,7 +206,7 @@ class _Proof:
                 for path, blob in trees.blobs(before, GENERATED_ROOTS)
                 if "/_charts/" in path and path not in wanted
             }
-            kept = release_file.kept_charts({}, charts, self.state)
+            kept = gitops.kept_charts({}, charts, self.state)
             wanted |= {path: _blob(text) for path, text in kept.items()}
         return _differing(wanted, self._committed)
 
@@ -254,7 +254,7 @@ class _Unreadable(Exception):
 
 def _loaded(repo: Repository, entry: LogEntry) -> State:
     try:
-        return state_in_effect.recorded_state(repo, entry).state
+        return snapshots.recorded_state(repo, entry).state
     except InvalidInput as error:
         raise _Unreadable(error.faults[0]) from None
 

@@ -18,13 +18,12 @@ from demandops.repo.git.local_repository import connect
 from demandops.repo.git.repository import access_error, reading
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import revisions
-from demandops.repo.load import state_in_effect
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.write.journal import Slot
+from demandops.serve.agenda import heartbeat_in
 from demandops.serve.approvals.approvals import Approvals
-from demandops.serve.demand_lifecycle import Demands
-from demandops.serve.queue import Listener, Ticket
-from demandops.serve.timing.pauses_and_limits import Heartbeat
+from demandops.serve.demands import Demands, Listener, Ticket
 from demandops.serve.worker import RemoteStatus, Worker
 
 log = logging.getLogger("demandops")
@@ -57,7 +56,7 @@ class Generator:
         progress: Progress = lambda done, total: None,
         runtime: Runtime = REAL,
     ) -> None:
-        heartbeat = Heartbeat(settings.alive_file())
+        heartbeat = heartbeat_in(settings.alive_file())
         signer = Signer(signing_key) if signing_key else None
         try:
             self._slot = Slot(data or settings.data_home(state_repo))
@@ -69,11 +68,11 @@ class Generator:
             )
             repository.signer, repository.runtime = signer, runtime
             try:
-                snapshot = state_in_effect.first_snapshot(repository, progress)
+                snapshot = snapshots.first_snapshot(repository, progress)
             except Exception:  # a power cut may have damaged the clone, which is only a copy
                 if not repository.renew_if_damaged():
                     raise
-                snapshot = state_in_effect.first_snapshot(repository, progress)
+                snapshot = snapshots.first_snapshot(repository, progress)
         except BaseException as error:
             self._slot.close()
             if isinstance(error, Exception):
@@ -112,7 +111,7 @@ class Generator:
         tip, now = self.snapshot.commit, self._runtime.now()
         with reading(self.address, objects):
             commit = revisions.resolve(objects, tip, revision, now)
-            return state_in_effect.snapshot_at(objects, commit.id)
+            return snapshots.snapshot_at(objects, commit.id)
 
     @property
     def remote_status(self) -> RemoteStatus:

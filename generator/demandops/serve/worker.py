@@ -1,4 +1,4 @@
-"""The worker: follows the state repo, and publishes the demands as commits."""
+"""The worker: follows the state repo, decides the demands, and publishes them as commits."""
 
 from __future__ import annotations
 
@@ -6,12 +6,24 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
+from math import inf
 
 from demandops.base import errors
-from demandops.base.errors import DemandOpsError, StateRepoError, Unsound
+from demandops.base.errors import (
+    DemandOpsError,
+    InvalidInput,
+    Refused,
+    StateRepoError,
+    Unsound,
+    Withdrawn,
+    fault,
+    internal,
+)
 from demandops.base.runtime import Runtime
-from demandops.decide.decision import Decision
+from demandops.decide.decision import Decision, Outcome, decide
+from demandops.decide.rollback import Restoration
 from demandops.model.config.config import Config
+from demandops.model.demand.demand import Demand, Rollback
 from demandops.repo.git import signing
 from demandops.repo.git.repository import (
     FetchInterrupted,
@@ -19,22 +31,32 @@ from demandops.repo.git.repository import (
     StateRepository,
     Unavailable,
     access_error,
+    disk_error,
 )
+from demandops.repo.git.signing import SigningFailed
+from demandops.repo.history.commit_log import operations_since
+from demandops.repo.load.ledger_files import restoration
 from demandops.repo.load.snapshot import ReadAhead, Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
+from demandops.serve.agenda import (
+    FIRST_REST_S,
+    LIMIT_LOCAL,
+    LIMIT_REMOTE,
+    LONGEST_EVALUATION_S,
+    Agenda,
+    Backoff,
+    RateLimit,
+    What,
+    may_take_long,
+    within,
+)
 from demandops.serve.approvals.approvals import Approvals, Result
-from demandops.serve.demand_lifecycle import Demands
-from demandops.serve.evaluation import Evaluator
-from demandops.serve.queue import Ticket
-from demandops.serve.timing import pauses_and_limits
-from demandops.serve.timing.agenda import Agenda
-from demandops.serve.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
-from demandops.serve.timing.pauses_and_limits import LONGEST_EVALUATION_S, Backoff, PollTimer
+from demandops.serve.demands import TAKEN_BACK, Demands, Receipt, Ticket
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
-# ---- whether the remote can be reached, for logs and diagnostics ----
-
 log = logging.getLogger("demandops")
+
+# ---- whether the remote can be reached, for logs and diagnostics ----
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +126,7 @@ class Worker:
         demands: Demands,
         approvals: Approvals,
         fetch_interval: float,
-        heartbeat: pauses_and_limits.Heartbeat,
+        heartbeat: Callable[[], object],
     ) -> None:
         self.snapshot = snapshot
         self.listeners: list[Callable[[Config], None]] = []
@@ -112,28 +134,22 @@ class Worker:
         self._repository, self._demands, self._approvals = repository, demands, approvals
         self._runtime = repository.runtime
         self._heartbeat = repository.while_waiting = heartbeat
-        self._evaluator = Evaluator(repository, demands, approvals)
-        self._timer = PollTimer(fetch_interval, repository.runtime, local=repository.always_current)
-        self._lease_expiry = LeaseExpiry(repository.runtime)
-        self._agenda = Agenda(repository.runtime)
+        self._rate_limit = RateLimit()
+        self._agenda = Agenda(fetch_interval, self._runtime, local=repository.always_current)
         self._ahead = ReadAhead()
-        self._batch_limit = (
-            pauses_and_limits.LIMIT_LOCAL
-            if repository.always_current
-            else pauses_and_limits.LIMIT_REMOTE
-        )
+        self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
+        self._backoff = Backoff(self._batch_limit, self._runtime)
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
         self._logged: list[errors.Fault] = []
         self._warned_of_signers = False
         self._ends_soon = self._runtime.event()
-        self._rest = pauses_and_limits.Rest(repository.runtime)
         self._warn_if_unsigned()
 
     # ---- from any thread ----
 
     def fetch_now(self) -> None:
-        self._timer.request()
+        self._agenda.request_fetch()
         self._demands.wake()
 
     def end_soon(self) -> None:
@@ -149,10 +165,14 @@ class Worker:
             # people may have decided about proposals before the start: answer these demands first
             if self._demands.proposed:
                 self._work()
-            while self._demands.wait(self._seconds_until_due()):
+            while self._demands.wait(min(self._due_in().values())):
                 self._heartbeat()
                 self._work()
         self._approvals.suspend()
+
+    def _due_in(self) -> dict[What, float]:
+        main = str(self.snapshot.commit) if self._approvals.proposals else ""
+        return self._agenda.seconds_until_due(self.snapshot.state, main)
 
     def _work(self) -> None:
         batch: list[Ticket] = []
@@ -163,20 +183,20 @@ class Worker:
                 self._publish(batch)
                 if self.snapshot.problems:  # after a release, an invalid change may be valid
                     self._try_to_carry_out_changes()
-            elif not self._rest:
+            elif not self._agenda.rest_left_s:
                 self._follow()
             if self._packs_since_tidy >= _TIDY_EVERY:
                 self._packs_since_tidy = 0
                 self._repository.tidy()
-            if not self._rest:
+            if self._approvals.proposals and not self._agenda.rest_left_s:
                 self._check_proposals()
         except Exception as error:
             self._fail(
                 batch, access_error(error, self._repository.address, self._repository.objects)
             )
         else:
-            if not self._rest:
-                self._rest.succeeded()
+            if not self._agenda.rest_left_s:
+                self._agenda.rest_s = FIRST_REST_S
                 self._runtime.recovered(_NAME)
 
     def _fail(self, batch: list[Ticket], error: Exception) -> None:
@@ -191,26 +211,16 @@ class Worker:
             self._runtime.failed(_NAME, error)
         if not batch:
             # not at each failure in a row, because git then reads all objects
-            if self._rest.follows_success:
+            if self._agenda.rest_s == FIRST_REST_S:
                 try:
                     self._repository.renew_if_damaged()
                 except StateRepoError as damage:
                     log.warning("%s", damage)
-            self._rest.begin()
-            self._timer.finished(reached=False)
+            self._agenda.rest()
+            self._agenda.fetched(reached=False)
         if not isinstance(error, DemandOpsError):
             error = errors.internal(error)
         self._demands.fail(batch, error)
-
-    def _seconds_until_due(self) -> float:
-        if self._rest:
-            return self._rest.seconds_left()
-        state, tip = self.snapshot.state, str(self.snapshot.commit)
-        seconds = self._approvals.seconds_until_due(tip, LONGEST_WAIT_S)
-        seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
-        seconds = self._agenda.seconds_until_due(state, seconds)
-        fetch = self._timer.seconds_until_due()
-        return seconds if fetch is None else min(seconds, fetch)
 
     # ---- publishing demands ----
 
@@ -218,12 +228,12 @@ class Worker:
         # also the demands that arrive during retries, and the ends of leases; the batch is empty
         # afterwards, unless an error is raised
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
-        backoff = Backoff(self._batch_limit, self._runtime)
+        self._backoff.begin_anew()
         while batch or self._ended_leases(self.snapshot):
             self._heartbeat()
             self._require_not_ending()
             try:
-                wait = self._attempt(batch, backoff)
+                wait = self._attempt(batch)
             except Exception as failure:
                 reason = access_error(failure, self._repository.address, self._repository.objects)
                 if isinstance(reason, PushDenied):
@@ -235,7 +245,7 @@ class Worker:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
                 self._record_unreachable(reason)
                 self._tip_is_fresh = self._repository.always_current
-                wait = backoff.unreachable()
+                wait = self._backoff.unreachable()
             if wait is None:
                 continue
             # Wait before the fetch, not after it, because the push must follow the fetch closely.
@@ -260,7 +270,7 @@ class Worker:
                 f"{reason}; the demand stays in the journal and is resumed at the next start"
             )
 
-    def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:
+    def _attempt(self, batch: list[Ticket]) -> float | None:  # noqa: PLR0912
         # the seconds to wait before the next attempt, or None to continue at once
         # fetch before a demand is committed, because after that it can no longer be withdrawn
         if self._must_fetch or self.remote.status.unreachable:
@@ -268,12 +278,13 @@ class Worker:
             self._must_fetch, self._tip_is_fresh = False, True
         self._demands.answer_withdrawn(batch)
         tip = self._repository.tip()
-        results = self._evaluator.published_before(str(tip), batch)
+        results = self._published_before(str(tip), batch)
         published = {ticket for ticket, _ in results}
         independent = len(results)
         left = [ticket for ticket in batch if ticket not in published]
-        part, left = left[: backoff.max_demands], left[backoff.max_demands :]
-        self._approvals.remove_released(part, self.snapshot.state)
+        part, left = left[: self._backoff.max_demands], left[self._backoff.max_demands :]
+        if self._approvals.proposals:
+            self._approvals.remove_released(part, self.snapshot.state)
         commits = self._new_commit_batch()
         # a person may have written to a repository on this disk since the tip was read, and the
         # search for published demands and the deletion of released branches hold only for that tip
@@ -283,17 +294,18 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
-            if number and (is_late or pauses_and_limits.may_take_long(ticket.demand)):
+            if number and (is_late or may_take_long(ticket.demand)):
                 part, left = part[:number], part[number:] + left
                 break
-            self._approvals.withdraw_released(results, ticket, commits.head.state)
-            results.append(self._evaluated(commits, ticket))
+            if ticket.demand.is_release:
+                self._approvals.withdraw_released(results, ticket, commits.head.state)
+            results.append(self._evaluate(commits, ticket))
             if commits.is_empty:
                 independent = len(results)
         # leases end last, because a demand that is still left may renew one
         if not left:
-            for ticket in self._ended_leases(commits.head)[: backoff.max_demands - len(part)]:
-                results.append(self._evaluated(commits, ticket))
+            for ticket in self._ended_leases(commits.head)[: self._backoff.max_demands - len(part)]:
+                results.append(self._evaluate(commits, ticket))
                 if self._runtime.monotonic() - began > LONGEST_EVALUATION_S:
                     break
         evaluated = self._runtime.monotonic()
@@ -305,28 +317,133 @@ class Worker:
         if self._publish_commits(commits, results, independent):
             batch[:] = left
             self._demands.put_back(batch, [ticket for ticket, _ in results])
-            backoff.published()
+            self._backoff.begin_anew()
             return None
         log.info("another writer was first; evaluating %d demands again", len(results))
         for ticket in part:
             ticket.mark_maybe_published(str(commits.start.commit))
         self._must_fetch = True
-        return backoff.overtaken(
+        return self._backoff.overtaken(
             len(results), evaluated - began, self._runtime.monotonic() - evaluated
         )
 
-    def _evaluated(self, commits: CommitBatch, ticket: Ticket) -> Result:
+    def _evaluate(self, commits: CommitBatch, ticket: Ticket) -> Result:
         self._heartbeat()
         before = commits.head.state
-        result = ticket, self._evaluator.evaluate(commits, ticket)
+        result = self._result_of(commits, ticket)
         # those that wait get the room that this demand frees before the next demand can take it
         self._agenda.waiting_turns.follow(commits, before)
-        return result
+        return ticket, result
+
+    def _result_of(  # noqa: PLR0912
+        self, commits: CommitBatch, ticket: Ticket
+    ) -> Receipt | DemandOpsError | Decision:
+        # A demand that needs approval gets no commit; its result is the decision. A receipt is true
+        # only once the batch is published. Errors that concern all demands are raised; others leave
+        # the rest of the batch alone.
+        if ticket.state == "withdrawn":
+            return Withdrawn(TAKEN_BACK)
+        try:
+            demand: Demand = ticket.demand
+            if isinstance(demand, Rollback):
+                demand = self._restoration(demand, commits.start)
+            state = commits.head.state
+            # of all services, once for each configuration; that is not this demand's work
+            state.usage()
+            state.names()
+            # what was booked must be released or restored, however long all of it takes
+            with processor_time(each=DEMAND_S, together=DEMAND_S if demand.adds_claims else inf):
+                decision = decide(
+                    state,
+                    demand,
+                    ticket.received,
+                    commits.read,
+                    lambda stage: ticket.notify(stage, stage),
+                    lambda request, config: self._rate_limit.faults(
+                        request, config, ticket.operation, ticket.received
+                    ),
+                    within(state.config.repo_settings.limits, self._runtime),
+                )
+            if self._approvals.proposals:
+                self._approvals.refuse_strangers(decision)
+            if decision.approval:
+                return decision
+            # from here on the demand can no longer be taken back
+            if not self._demands.commit(ticket):
+                return Withdrawn(TAKEN_BACK)
+            if decision.request.operation == "put":
+                self._approvals.withdraw_replaced(decision.request)
+            if decision.outcome == "waiting":
+                ticket.notify("waiting", f"waiting for room: {'; '.join(decision.warnings)}")
+            if decision.files:
+                now = self._runtime.now()
+                commit = commits.commit(decision, ticket.operation, ticket.received, now)
+                ticket.notify("committed", f"committed {commit}")
+            else:
+                waits = decision.outcome == "waiting"  # the demand waited already
+                commits.record_in_next_commit(ticket.operation, "waiting" if waits else "unchanged")
+                commit = str(commits.head.commit)
+            return self._approvals.receipt(ticket, decision, commit, state)
+        except InvalidInput as error:
+            if ticket.has_released:  # the demand released a proposal, which had no claims yet
+                commits.record_in_next_commit(ticket.operation, "released")
+                commit = str(commits.head.commit)
+                return Receipt(ticket.operation, ticket.demand.id, "released", commit)
+            commits.record_in_next_commit(ticket.operation, "refused")
+            return error
+        except SigningFailed as error:
+            return error
+        except Exception as error:  # a bug that one demand triggers must not stop the others
+            reason = disk_error(error, self._repository.address)
+            if reason is not None:  # the state repo fails, so no demand can be evaluated
+                raise reason from None
+            log.exception("internal error while evaluating demand %s", ticket.operation)
+            return internal(error)
+
+    def _restoration(self, rollback: Rollback, head: Snapshot) -> Restoration:
+        to = rollback.to
+        if not self._repository.includes(str(head.commit), to):
+            message = f"commit {to} is not in the history of the state repo; roll back to one that "
+            raise Refused([fault("", f"{message}is")])
+        return restoration(self._repository.objects, rollback)
+
+    def _published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
+        # Oldest first, the results of those demands that main records already. They have no answer
+        # because the process or the connection ended after the push, or because an fsync failed.
+        sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
+        bases = dict.fromkeys(ticket.base for ticket in sought.values())
+        objects = self._repository.objects
+        histories = [(base, operations_since(objects, tip, base)) for base in bases]
+        # all bases are ancestors of the tip, so the most outcomes are those since the oldest base
+        since, recorded = max(histories, key=lambda history: len(history[1]), default=("", {}))
+        if published := [operation for operation in reversed(recorded) if operation in sought]:
+            # after a failed fsync only files that are written anew are sure to be on the disk
+            self._repository.write_anew(since)
+        for operation in sought.keys() - published:
+            sought[operation].base = tip  # the next search begins here
+        results = list[Result]()
+        for ticket in (sought[operation] for operation in published):
+            record = recorded[ticket.operation]
+            if record.outcome == "refused":
+                message = "the demand was refused, but the reason was lost; send the demand again"
+                results.append((ticket, Refused([fault("", message, code="refused")])))
+                continue
+            outcome: Outcome = "booked"
+            if record.outcome != "changed":
+                outcome = record.outcome
+            elif ticket.demand.operation == "rollback":
+                outcome = "restored"
+            elif ticket.demand.is_release or ticket.demand.operation == "decommission":
+                outcome = "released"
+            receipt = Receipt(ticket.operation, ticket.demand.id, outcome, record.commit)
+            results.append((ticket, receipt))
+        return results
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
-        if self._rest or self._demands.has_queued:  # a queued demand may renew a lease
+        # a queued demand may renew a lease
+        if self._demands.has_queued or self._agenda.rest_left_s:
             return []
-        return self._lease_expiry.tickets(snapshot.state.ledger)
+        return self._agenda.leases.tickets(snapshot.state.ledger)
 
     def _publish_commits(
         self, commits: CommitBatch, results: list[Result], independent: int
@@ -358,33 +475,40 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        is_due = self._agenda.is_due(self.snapshot.state)
+        due_in = self._due_in()
+        is_due = due_in["own work"] == 0
         try:
-            if self._timer.start_if_due():
+            if due_in["fetch"] == 0:
+                self._agenda.fetch_begins()
                 # a demand that arrives ends the fetch, because its push finds new commits too
-                self._repository.refresh(lambda: self._demands.must_not_wait)
+                self._repository.refresh(
+                    lambda: self._demands.has_queued or self._demands.is_closed
+                )
             # in a repository on this disk, each turn reads the tip, because that is cheap
             elif not (self._repository.always_current or is_due):
                 return
             new = is_due or self._repository.tip() != self.snapshot.commit
             self._record_reached(pushed=new and self._carry_out_changes())
         except FetchInterrupted:
-            self._timer.request()  # the fetch is still due
+            self._agenda.request_fetch()  # it is still due
         except StateRepoError as error:
             self._record_unreachable(error)
             self._agenda.postpone()
 
     def _check_proposals(self) -> None:
-        if not self._approvals.is_due(str(self.snapshot.commit)):
+        main, has_news = str(self.snapshot.commit), self._approvals.has_news
+        if not self._agenda.check_is_due(main, has_news=has_news):
             return
         try:
-            heads = self._approvals.fetch_heads()
+            self._agenda.check_begins()
+            heads = self._approvals.branches.heads()
             if heads.main != str(self.snapshot.commit):
                 self._repository.refresh()
                 self._try_to_carry_out_changes()
             # a deleted branch may have been merged, which only a main as new as ``heads`` shows
             if self._repository.includes(str(self.snapshot.commit), heads.main):
                 self._approvals.check(self.snapshot, heads)
+                self._agenda.checked(str(self.snapshot.commit))
         except (Unavailable, PushDenied) as error:
             log.warning("%s; the demands that await approval keep waiting", error)
 
@@ -405,7 +529,8 @@ class Worker:
             self._repository.refresh()
             # at random, so that generators which all saw the change do not collide again
             self._ends_soon.wait(self._runtime.uniform(0, 0.05))
-        return False  # other generators are faster, and they carry out the same changes
+        self._agenda.postpone()  # other generators are faster, and they carry out the same changes
+        return False
 
     def _new_commit_batch(self) -> CommitBatch:
         # its first commits render people's changes, and do the own work that is due
@@ -434,7 +559,8 @@ class Worker:
         # also true after a person's merge that needs no commit of the generator
         if self.snapshot.commit != before.commit:
             self._packs_since_tidy += 1
-            self._warn_if_unsigned()
+            if commits.start.commit != before.commit:  # people may have listed who may sign
+                self._warn_if_unsigned()
             for listener in self.listeners:
                 listener(self.snapshot.state.config)
 
@@ -453,11 +579,11 @@ class Worker:
     def _record_reached(self, *, pushed: bool) -> None:
         self._demands.blocked = ""
         self.remote.record_reached(pushed=pushed)
-        self._timer.finished(reached=True)
+        self._agenda.fetched(reached=True)
 
     def _record_unreachable(self, error: StateRepoError) -> None:
         if self._ends_soon.is_set():  # there is no retry to report
             return
         self._demands.blocked = str(error)
         self.remote.record_unreachable(str(error))
-        self._timer.finished(reached=False)
+        self._agenda.fetched(reached=False)

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from functools import lru_cache
-from pathlib import Path
+from functools import cache
 from types import CodeType
 from typing import Any
 
@@ -93,10 +92,10 @@ OPTIONS: dict[str, Any] = {
 }
 
 
-@lru_cache(maxsize=1)
-def _own(folder: Path) -> Environment:
+@cache
+def _own() -> Environment:
     environment = Environment(  # noqa: S701 - YAML, not HTML
-        loader=FileSystemLoader(folder),
+        loader=FileSystemLoader(data_folder("templates")),
         bytecode_cache=CompiledTemplates(),
         **OPTIONS,
     )
@@ -106,4 +105,4 @@ def _own(folder: Path) -> Environment:
 
 
 def text(template: str, **context: object) -> str:  # such as `flux/release.yaml.j2`
-    return _own(data_folder("templates")).get_template(template).render(**context)
+    return _own().get_template(template).render(**context)

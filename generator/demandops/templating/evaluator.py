@@ -166,7 +166,11 @@ class _Child:
             changed = {path: text for path, text in files.items() if sent.get(path) != text}
             changed |= dict.fromkeys(sent.keys() - files.keys())
         parts = {field.name: getattr(task, field.name) for field in fields(task)}
-        question = _encoded({"files": changed, "seconds": seconds}) + _encoded(parts)
+        # Two lines: there are no line breaks within JSON. ASCII has an escape for what UTF-8 cannot
+        # encode.
+        head = {"files": changed, "seconds": seconds}
+        lines = (json.dumps(line, default=dict) + "\n" for line in (head, parts))
+        question = "".join(lines).encode("ascii")
         stdin, stdout = self._process.stdin, self._process.stdout
         assert stdin is not None and stdout is not None  # noqa: S101 - both are pipes
         unsent = memoryview(question)
@@ -210,16 +214,6 @@ class _Child:
             with suppress(OSError):  # what was not sent yet
                 if pipe:
                     pipe.close()
-
-
-def _encoded(message: object) -> bytes:
-    def plain(value: object) -> object:
-        if isinstance(value, Mapping):
-            return dict(value)
-        raise TypeError(f"a {type(value).__name__} cannot be sent to a child")
-
-    # ASCII has an escape for what UTF-8 cannot encode; there are no line breaks within JSON
-    return json.dumps(message, default=plain).encode("ascii") + b"\n"
 
 
 EVALUATE = Evaluator()

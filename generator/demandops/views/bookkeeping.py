@@ -85,6 +85,8 @@ class DemandEntry:
     action: Literal["Demand", "DeploymentRequest"]  # the ROS action that takes such a demand
     request: str
     requesters: list[str]
+    # applications that it does not list, each with those that read its outputs
+    held_for: dict[str, list[str]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +178,11 @@ def bookkeeping(world: World) -> Bookkeeping:
             "DeploymentRequest" if claims[0].joined else "Demand",
             claims[0].request,
             list(requesters_of(claims)),
+            {
+                claim.subject.id: list(claim.application.held_for)
+                for claim in claims
+                if claim.is_on_application and claim.application.held_for
+            },
         )
         for demand, claims in sorted(by_demand.items())
     }
@@ -218,6 +225,9 @@ def carried_topics(entry: Mapping[str, Any]) -> _Requesters:
 
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
     data = asdict(view) | {"commit": commit}
+    for entry in data["demands"].values():
+        if not entry["held_for"]:
+            del entry["held_for"]
     for entry in data["connections"].values():
         for name in ("targets", "listed"):
             if not entry[name]:

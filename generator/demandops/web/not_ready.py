@@ -16,7 +16,8 @@ from demandops.model.config.override import Override
 from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
-from demandops.repo.history.commit_log import GENERATOR_NAME, LogEntry
+from demandops.repo.history.commit_log import LogEntry
+from demandops.repo.history.commit_message import GENERATOR_NAME
 from demandops.repo.load.last_valid_config import Problem
 from demandops.views import release_causes
 from demandops.web.lists import Cell, Filter, Link, Part, Row, cell, exactly

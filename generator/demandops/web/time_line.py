@@ -11,7 +11,7 @@ from statistics import median
 
 from demandops.model.config.base_model import span
 from demandops.model.config.override import OVERRIDES_ROOT
-from demandops.repo.history.commit_log import PROPOSAL
+from demandops.repo.history.commit_message import PROPOSAL
 from demandops.web.lists import Filter, Row, cell
 from demandops.web.situation import WORDS, Commit, HealthChange
 

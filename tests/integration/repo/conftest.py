@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from demandops.serve.approvals import forge_worker
+from demandops.serve import agenda
 
 from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server, serving
@@ -41,7 +41,7 @@ def petra(person: Person, monkeypatch: pytest.MonkeyPatch) -> Person:
 
     The policy requires approval for all demands, and generators often check for decisions.
     """
-    monkeypatch.setattr(forge_worker, "CHECK_LOCAL_S", 0.05)
-    monkeypatch.setattr(forge_worker, "CHECK_REMOTE_S", 0.1)
+    monkeypatch.setattr(agenda, "CHECK_LOCAL_S", 0.05)
+    monkeypatch.setattr(agenda, "CHECK_REMOTE_S", 0.1)
     person.policy(approval="required")
     return person

@@ -17,8 +17,8 @@ import pytest
 import yaml
 from demandops.base.errors import InvalidInput
 from demandops.base.settings import GENERATED_ROOTS
-from demandops.repo.history import commit_message
-from demandops.repo.load import snapshot, state_in_effect
+from demandops.repo.history import commit_log
+from demandops.repo.load import snapshot as snapshots
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -84,11 +84,11 @@ def test_a_start_at_any_commit_finds_what_the_running_generator_has(
         for _ in range(10):
             files = _change(random, bare, nodes)
             made = person.change(files)
-            alone = state_in_effect.state_at(repo, made)
+            alone = snapshots.state_at(repo, made)
             generator.fetch_now()
             rig.wait_until(lambda commit=made: includes(generator, commit), f"{made} is followed")
             running = generator.snapshot
-            again = state_in_effect.state_at(repo, running.commit)
+            again = snapshots.state_at(repo, running.commit)
             for found in (alone, again):
                 assert found.state.config == running.state.config, files
                 assert {c.key: c for c in found.state.ledger} == {
@@ -152,15 +152,15 @@ def test_broken_files_are_judged_once_and_not_on_each_demand(
 ) -> None:
     parsed: list[int] = []
     asked: list[str] = []
-    load, origin_of = snapshot.load_config, commit_message.fault_origin
+    load, origin_of = snapshots.load_config, commit_log.fault_origin
 
     def fault_origin(*args: Any) -> Callable[[str], tuple[str, str] | None]:
         origin = origin_of(*args)
         return lambda path: (asked.append(path), origin(path))[1]
 
-    monkeypatch.setattr(commit_message, "fault_origin", fault_origin)
+    monkeypatch.setattr(commit_log, "fault_origin", fault_origin)
     monkeypatch.setattr(
-        snapshot, "load_config", lambda files: (parsed.append(len(files)), load(files))[1]
+        snapshots, "load_config", lambda files: (parsed.append(len(files)), load(files))[1]
     )
     rig.book(generator, goal(1))
     nodes = "".join(f"  - {{id: n{i}, type: [], cluster: 5}}\n" for i in range(2_000))

@@ -24,7 +24,6 @@ from demandops.repo.git.repository import (
     RemoteAway,
     disk_error,
 )
-from demandops.repo.git.signing import create_commit
 from demandops.repo.history.commit_message import generator_signature
 from demandops.serve.generator import Generator
 
@@ -380,7 +379,7 @@ def test_a_full_disk_of_the_clone_is_told_at_a_push(url: str, bare: Path, tmp_pa
     repository = RemoteRepository(url, tmp_path / "clone.git", print, allow_offline=False)
     before = repository.tip()
     tree, who = repository.objects[before].peel(pygit2.Tree).id, generator_signature(NOW)
-    commit = create_commit(repository.new, None, (who, who), "Again\n", tree, [before])
+    commit = repository.new.add_commit(None, (who, who), "Again\n", tree, [before])
     with files_end_at(10), pytest.raises(DiskFull, match=r"clone\.git cannot be written"):
         repository.publish(before, commit)
 

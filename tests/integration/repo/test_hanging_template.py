@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from demandops.base.errors import OverLimit
 from demandops.model.demand import goals as demand_goals
-from demandops.serve import evaluation
+from demandops.serve import worker
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -81,7 +81,7 @@ def test_what_shares_a_service_may_leave_and_is_renewed(bare: Path, person: Pers
 def test_a_rollback_may_take_longer_than_a_demand(
     bare: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(evaluation, "DEMAND_S", 0.05)  # hundreds of services take half a second
+    monkeypatch.setattr(worker, "DEMAND_S", 0.05)  # hundreds of services take half a second
     with rig.running(bare) as generator:
         demands = []
         for number in range(60):

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 from demandops.base import settings
 from demandops.model.ledger.claim import Claim
-from demandops.repo.write.journal import JournalEntry, Slot
+from demandops.repo.write.journal import Slot
+from demandops.serve.agenda import LIMIT_LOCAL
 from demandops.serve.generator import Generator
-from demandops.serve.timing.pauses_and_limits import LIMIT_LOCAL
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock
@@ -103,7 +103,7 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
     # so many others before it that it is not in the first batch
     others = {f"op-{number}": renew("nothing") for number in range(LIMIT_LOCAL)}
     for operation, goal in (others | {"op-renew": renew("d")}).items():
-        slot.journal.append([JournalEntry(operation, goal, received, rig.tip(bare))])
+        slot.journal.append([rig.journaled(operation, goal, received, rig.tip(bare))])
     slot.close()
     clock.pass_(100)
     with rig.running(bare, runtime=clock) as generator:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from demandops.base.errors import StateRepoError, Unsound
 from demandops.repo.git.local_repository import LocalRepository
-from demandops.repo.write.journal import Journal, JournalEntry
+from demandops.repo.write.journal import Journal
 
 from tests.kit import rig
 from tests.kit.repo import git, tip
@@ -53,7 +53,7 @@ def test_a_published_demand_without_an_answer_is_written_to_new_files(bare: Path
     inodes = {path.name: path.stat().st_ino for path in (branch, *packs.iterdir())}
     at = tip(bare)
     again = Journal(journal)  # a journal as before the answer
-    again.append([JournalEntry("op-1", rig.goal(1), "2026-03-01T00:00:00+00:00", before)])
+    again.append([rig.journaled("op-1", rig.goal(1), "2026-03-01T00:00:00+00:00", before)])
     again.close()
     assert rig.restart(bare) is True
     assert (tip(bare), rig.operations(bare)) == (at, ["op-1"])
@@ -66,7 +66,7 @@ def test_a_journal_whose_sync_fails_answers_nobody(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     journal = Journal(tmp_path / "outbox.jsonl")
-    entry = JournalEntry("op-1", {}, "2026-03-01T00:00:00+00:00", "")
+    entry = rig.journaled("op-1", {}, "2026-03-01T00:00:00+00:00", "")
 
     def fail(file: int) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO))

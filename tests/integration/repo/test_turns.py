@@ -6,7 +6,7 @@ import shutil
 import threading
 from pathlib import Path
 
-from demandops.repo.write.journal import JournalEntry, Slot
+from demandops.repo.write.journal import Slot
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -41,7 +41,7 @@ def test_resumed_demands_are_answered_in_the_order_of_their_commits(
     # a journal as if the process had died before op-2's answer and op-1's publication
     slot, turns, answered = Slot(tmp_path), Turns(1), []
     slot.journal.append(
-        JournalEntry(f"op-{number}", rig.goal(number), turns.now().isoformat(), base)
+        rig.journaled(f"op-{number}", rig.goal(number), turns.now().isoformat(), base)
         for number in (1, 2)
     )
     slot.close()

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from demandops.repo.write.commit_batch import CommitBatch
-from demandops.repo.write.journal import JournalEntry, Slot
+from demandops.repo.write.journal import Slot
+from demandops.serve.agenda import WaitingTurns
 from demandops.serve.generator import Generator
-from demandops.serve.timing.agenda import WaitingTurns
 from demandops.templating.evaluator import processor_time
 
 from tests.integration.repo.test_hanging_template import ENDLESS, TEMPLATE
@@ -63,7 +63,7 @@ def test_a_waiting_demand_whose_answer_was_lost_is_answered_again(
 
     slot = Slot(tmp_path / "second")
     received = tickets[2].received.isoformat()
-    slot.journal.append([JournalEntry("op-2", goals[2], received, base)])
+    slot.journal.append([rig.journaled("op-2", goals[2], received, base)])
     slot.close()
     again = Generator(str(bare), data=tmp_path / "second", runtime=turns)
     resumed = again._demands._tickets["op-2"].future

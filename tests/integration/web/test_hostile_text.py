@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shlex
 
-from demandops.repo.history.commit_log import PROPOSAL
+from demandops.repo.history.commit_message import PROPOSAL
 from demandops.serve.generator import Generator
 from demandops.web.follower import Follower
 

@@ -29,6 +29,7 @@ from demandops.connections.connection import (
 from demandops.decide.decision import Decision
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.ledger import claim as claim_files
+from demandops.templating import engine
 from demandops.views import release_causes
 
 from tests.kit.connections import ROS_IMAGE, demand, routes, state
@@ -92,7 +93,7 @@ RELAY = RelayType()
 
 
 @pytest.fixture(autouse=True)
-def a_fourth_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def a_fourth_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     shutil.copytree(settings.data_folder("templates"), tmp_path / "templates")
     shutil.copytree(RELAY_TEMPLATES, tmp_path / "templates" / "connections" / "relay")
     for name in ("appdefs", "state-repo-skeleton"):
@@ -100,6 +101,9 @@ def a_fourth_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(settings, "_CHECKOUT", tmp_path)
     types = (*connection_types.CONNECTION_TYPES, RELAY)
     monkeypatch.setattr(connection_types, "CONNECTION_TYPES", types)
+    engine._own.cache_clear()
+    yield
+    engine._own.cache_clear()
 
 
 def repo() -> MemoryRepo:

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.errors import OverBudget, Refused
-from demandops.decide.decision import MOST_TRIALS, decide
+from demandops.decide.decision import decide
+from demandops.decide.placement.placement import MOST_ATTEMPTS
 
 from tests.kit.config import override, skeleton
 from tests.kit.goals import Goal, application, connection, goal, perception
@@ -113,12 +114,20 @@ def test_what_no_node_changes_is_not_tried_on_each_node(refused: dict[str, Any],
     assert twice < 2.5 * many, "the cost must grow with the demand and not faster"
 
 
+def test_a_placement_on_a_thousand_nodes_costs_little_more_than_on_ten() -> None:
+    made, work = demand([app(0, connect="none")]), []
+    for books in (repo(10), repo(1_000)):
+        assert books.decide(made).outcome == "booked"  # templates are compiled once
+        work.append(work_of(books, made)[0])
+    assert work[1] < 3 * work[0]
+
+
 DENIED = {"overrides/no.yaml": override({"nodes": [f"e{n:03}" for n in range(10)]}, deny=True)}
 
 
 def test_trials_are_bounded_by_number_and_the_answer_has_the_first_refusal_too() -> None:
     books = repo(12, DENIED)
-    few = MOST_TRIALS // 11  # each application is denied on ten nodes and booked on the eleventh
+    few = MOST_ATTEMPTS // 11  # each application is denied on ten nodes and booked on the eleventh
     assert books.decide(demand(app(n, connect="none") for n in range(few))).outcome == "booked"
     refusal = books.take(demand(app(n, connect="none") for n in range(few + 2)))
     assert codes(refusal) == {"denied", "too-large"}

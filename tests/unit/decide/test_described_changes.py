@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from tests.kit.config import edited
+from tests.kit.config import brokers, edited
 from tests.kit.memory import MemoryRepo
 
 _APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
@@ -31,7 +31,8 @@ def test_a_parameter_that_the_values_do_not_use_is_no_part_of_a_change() -> None
 
 
 def test_what_is_listed_twice_is_warned_of_once() -> None:
-    app = {"header": {"id": "a", "node_id": "vehicle01"}, "type": 1}
+    app = {"header": {"id": "a", "node_id": "edge"}, "type": 1}
     app |= {"object_detection_fusion_app": {"requester_ids": ["u"], "ego_data_topics": [_TOPIC]}}
-    (warning,) = MemoryRepo().send({"id": "r", "apps": [app, app]}).warnings
+    without_brokers = MemoryRepo(brokers())  # so that no connection can be derived
+    (warning,) = without_brokers.send({"id": "r", "apps": [app, app]}).warnings
     assert "no connection carries /a" in warning

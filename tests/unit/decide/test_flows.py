@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import pytest
 import yaml
 from demandops.base.errors import Refused
-from demandops.decide.placement.relocation import changed_claim_files, following_overrides
+from demandops.decide.edits import changed_claim_files
+from demandops.decide.placement.relocation import following_overrides
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
 from demandops.decide.state import rendered_files

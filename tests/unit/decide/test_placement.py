@@ -174,3 +174,19 @@ def test_the_answer_and_the_commit_say_which_node_and_why(
     again = repo.send(sent)
     assert again.outcome == "unchanged"
     assert again.placed == (f"{what}{says.partition(',')[0]}, where it is booked already",)
+
+
+def test_a_service_that_runs_for_a_topic_already_is_shared_there() -> None:
+    vehicle, edge = {"id": SOURCES[0], "type": "vehicle"}, {"id": "edge"}
+    nodes = [vehicle, edge, *({"id": id, "capabilities": ["gpu"]} for id in ("a", "b"))]
+    place = {"services": {"object-detection": {"place": {"capabilities": ["gpu"]}}}}
+    repo = repo_with(nodes, **{"appdefs/object-detection-fusion/appdef.yaml": place})
+    inputs = {"point_cloud": [{"topic": "/points", "source": SOURCES[0]}]}
+    told = []
+    for id in ("first", "second"):
+        sent = asking({}, id, id, node="edge", inputs=inputs, connect="none")
+        told += repo.send(sent).placed
+    place_of = "service 'object-detection' of application '{}' is placed on 'a', {}"
+    why = "the one with the fewest applications among 2 nodes that fit"
+    shared = "where the service already runs for this topic"
+    assert told == [place_of.format("first", why), place_of.format("second", shared)]

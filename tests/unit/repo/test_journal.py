@@ -14,8 +14,8 @@ from demandops.base.errors import StateRepoError
 from demandops.repo.write.journal import (
     DamagedJournal,
     Journal,
-    JournalEntry,
     ProposalRecord,
+    Record,
     Slot,
     parse,
     read,
@@ -27,11 +27,12 @@ from tests.kit.limits import files_end_at
 PROPOSAL = ProposalRecord("demand/x", ("a",))
 
 
-def entry(name: str, goal: object = "wish") -> JournalEntry:
-    return JournalEntry(f"op-{name}", {"id": goal}, "2026-01-31T12:00:00+00:00", "b" * 4)
+def entry(name: str, goal: object = "wish") -> Record:
+    received = "2026-01-31T12:00:00+00:00"
+    return {"operation": f"op-{name}", "goal": {"id": goal}, "received": received, "base": "bbbb"}
 
 
-def pending(text: bytes) -> dict[str, JournalEntry]:
+def pending(text: bytes) -> dict[str, Record]:
     return parse(text, Path("outbox.jsonl"))
 
 
@@ -47,7 +48,7 @@ def text(path: Path) -> bytes:
     journal.append([entry("a"), entry("b")])
     journal.append([entry("c")])
     journal.mark_done(["op-b"])
-    journal.append([JournalEntry("op-c", {}, "2026-01-31T12:00:00+00:00", "", PROPOSAL)])
+    journal.append([entry("c") | {"proposal": PROPOSAL}])
     return path.read_bytes()
 
 
@@ -55,7 +56,7 @@ def test_the_journal_reads_back_the_entries_that_are_not_done(path: Path, text: 
     found = pending(text)
     assert list(found) == ["op-a", "op-c"]
     assert found["op-a"] == entry("a")
-    assert found["op-c"].proposal == PROPOSAL
+    assert found["op-c"]["proposal"] == PROPOSAL
     assert Journal(path).pending == found
     assert len(path.read_bytes().splitlines()) == 2, (
         "a start must leave out the demands that are done"
@@ -128,7 +129,7 @@ def test_the_file_stays_small_however_many_demands_pass(path: Path, waiting: int
     for number in range(100):
         batch = [entry(f"{number}-{each}", "x" * 100) for each in range(100)]
         journal.append(batch)
-        journal.mark_done(each.operation for each in batch)
+        journal.mark_done(each["operation"] for each in batch)
         largest = max(largest, path.stat().st_size)
     written = 10_000 * 300
     assert largest < (1 << 20) + 3 * waiting * 250 + 100 * 400 < written

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pygit2
 from demandops.base.quoting import harmless, is_visible, one_line
-from demandops.repo.history.commit_log import compose, parse
+from demandops.repo.history.commit_message import compose, parse
 from hypothesis import example, given
 from hypothesis import strategies as st
 

@@ -8,7 +8,8 @@ import pygit2
 import pytest
 from demandops.base.naming import id_problem
 from demandops.repo.history import commit_log, commit_message
-from demandops.repo.history.commit_log import compose, operations_since, parse
+from demandops.repo.history.commit_log import operations_since
+from demandops.repo.history.commit_message import compose, parse
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -57,8 +58,8 @@ def test_every_id_is_read_back_by_git_and_by_us_as_it_was(
 
 
 def _commit(repo: pygit2.Repository, operation: str, *parents: pygit2.Oid) -> pygit2.Oid:
-    name = commit_log.GENERATOR_NAME if operation else "x"
-    who = pygit2.Signature(name, commit_log.GENERATOR_EMAIL, 0, 0)
+    name = commit_message.GENERATOR_NAME if operation else "x"
+    who = pygit2.Signature(name, commit_message.GENERATOR_EMAIL, 0, 0)
     text = f"Join\n\nOperation-Id: {operation}\nRender-Version: 1\n" if operation else "By hand\n"
     return repo.create_commit(None, who, who, text, repo.TreeBuilder().write(), list(parents))
 

@@ -1,4 +1,4 @@
-"""`trees.write` and `trees.differences` agree with a model of a file tree: a dict by path."""
+"""Writing and comparing trees agree with a model of a file tree: a dict by path."""
 
 from __future__ import annotations
 
@@ -104,11 +104,11 @@ def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.Da
     more = data.draw(changes(wanted), "more")
     with scratch() as repo:
         new = NewObjects(repo)
-        made = trees.write(new, lay(repo, files) if files else None, change)
+        made = new.add_tree(lay(repo, files) if files else None, change)
         assert read(repo, made) == wanted
         assert made == lay(repo, wanted).id, "the tree has an empty folder or a wrong mode"
         for further in (more, {}):  # each starts from a tree that `new` has
-            again = trees.write(new, repo[made].peel(pygit2.Tree), further)
+            again = new.add_tree(repo[made].peel(pygit2.Tree), further)
             assert again == lay(repo, changed(wanted, further)).id
 
 
@@ -183,7 +183,7 @@ def test_git_reads_packed_files_of_every_size(tmp_path: Path) -> None:
     new = NewObjects(repo)
     sizes = [0, 1, 15, 16, 17, 2047, 2048, 2049, 300_000]
     files: dict[str, str | None] = {f"f{size}": "é" + "x" * size for size in sizes}
-    tree = trees.write(new, None, files)
+    tree = new.add_tree(None, files)
     who = pygit2.Signature("A", "a@example.org", 1_770_000_000)
     text = repo.create_commit_string(who, who, "x", tree, [])
     commit = new.add(pygit2.enums.ObjectType.COMMIT, text.encode())
@@ -207,7 +207,7 @@ def test_git_reads_an_index_whose_offsets_need_more_than_31_bits(tmp_path: Path)
     offsets = [12, 2**31 - 1, 2**31, 2**40]
     packed = [Packed(bytes([place]) * 20, 7 * place, one) for place, one in enumerate(offsets)]
     index = tmp_path / "x.idx"
-    index.write_bytes(b"".join(index_of(reversed(packed), b"\0" * 20)))
+    index.write_bytes(index_of(reversed(packed), b"\0" * 20))
     with index.open("rb") as file:
         shown = subprocess.run(
             ["git", "show-index"], check=True, stdin=file, capture_output=True, text=True

@@ -11,8 +11,7 @@ from demandops.base.errors import QueueFull
 from demandops.base.runtime import REAL
 from demandops.model.demand import goals
 from demandops.repo.write.journal import Journal
-from demandops.serve.demand_lifecycle import Demands
-from demandops.serve.queue import FairQueue, Ticket
+from demandops.serve.demands import Demands, FairQueue, Ticket
 
 from tests.kit.memory import NOW
 

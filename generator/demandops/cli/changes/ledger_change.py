@@ -25,11 +25,11 @@ from demandops.model.demand import goals
 from demandops.model.demand.demand import Decommission, Demand, Rollback
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo import reader
-from demandops.repo.history import commit_message
+from demandops.repo.history import commit_log
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
+from demandops.serve.demands import Receipt
 from demandops.serve.generator import Generator
-from demandops.serve.queue import Receipt
 
 # ---- booking, and printing the changes ----
 
@@ -136,7 +136,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
       demandops decommission edge --node
     """
     chosen = frozenset([kinds] if kinds else ["node", "requester"])
-    by = commit_message.operator()
+    by = commit_log.operator()
     goal = goals.decommission(name, chosen, str(by), reason)
     if dry_run or person_change.is_asked(yes, output):
         row = _dry_run_decommission(goal, state_repo, output)

@@ -25,7 +25,7 @@ from demandops.model.ledger.ledger import World
 from demandops.repo import reader
 from demandops.repo.forge import ForgeError, forge_for
 from demandops.repo.git.signing import Signer
-from demandops.repo.history.commit_message import Person
+from demandops.repo.history.commit_log import Person
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails, Published

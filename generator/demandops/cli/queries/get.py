@@ -129,9 +129,14 @@ def _key(name: str) -> Values:
 _COMMON = {"node": _key("nodes"), "requester": _key("requesters"), "domain": _key("domains")}
 
 
+def _subject_lines(item: Json) -> list[str]:
+    held_for = [f"held for {id}" for id in item["held_for"]]
+    return ["{kind} {id}".format(**item["subject"]), *held_for]
+
+
 class _Claims(Kind):
     columns = (
-        column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
+        column("Subject", lambda item, now: _subject_lines(item)),
         column("Requesters", joined("requesters"), 1, wraps=True),
         column("State", "state", 2),
         column("Since", _ago("since"), 3),

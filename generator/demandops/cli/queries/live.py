@@ -24,7 +24,7 @@ from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
 from demandops.repo import reader
 from demandops.repo.reader import Reader
-from demandops.serve.timing.pauses_and_limits import parse_interval
+from demandops.serve.agenda import parse_interval
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 

@@ -257,6 +257,10 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
         if claim["services"]:
             nodes = ", ".join(f"{name} on {node}" for name, node in claim["services"].items())
             yield f"    services on nodes of their own: {nodes}"
+        for id, outputs in claim["reads"].items():
+            yield f"    reads {', '.join(outputs)} of application '{id}'"
+        for id, outputs in claim["held_for"].items():
+            yield f"    held for application '{id}', which reads {', '.join(outputs)} of it"
         if claim["suspended_by"]:
             yield f"    suspended by {_override_text(claim['suspended_by'])}"
         if claim["kept_by"]:

@@ -108,6 +108,7 @@ def _application_faults(app: Application, config: Config, claiming: bool) -> Ite
         (f"inputs.{role}[{position}]", topic)
         for role, topics in app.inputs.items()
         for position, topic in enumerate(topics)
+        if not topic.application  # its faults are those of the application whose output it is
     ]
     yield from _connect_faults(app.connect)
     # a shutdown may leave out nodes and sources, because it lists what is booked already

@@ -10,8 +10,8 @@ from demandops.connections.connection import Connection
 from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
-from demandops.decide.placement import placement
-from demandops.decide.planning import flows
+from demandops.decide.planning import chains
+from demandops.decide.planning.overrides import with_overridden_nodes
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.inventory import id_in_domain
@@ -27,13 +27,8 @@ from demandops.model.demand.demand import (
 from demandops.model.ledger.ledger import Ledger
 
 
-def completed(
-    demand: AnyDemand, state: State, trial: placement.Trial | None, checkpoint: Callable[[], None]
-) -> tuple[AnyDemand, list[Fault]]:
-    """Return the demand with everything that the generator adds, and the faults of its choices.
-
-    If ``trial`` is given, a node is chosen only if ``trial`` accepts the demand with this node.
-    """
+def prepared(demand: AnyDemand, state: State) -> tuple[AnyDemand, list[Fault]]:
+    """Return the demand with all that does not depend on the nodes that are chosen for it."""
     config, ledger = state.config, state.ledger
     if isinstance(demand, Decommission):
         return replace(demand, nodes=config.nodes_of(demand.id), is_complete=True), []
@@ -41,16 +36,22 @@ def completed(
     # the id of a separate instance comes first, because the placement looks for claims on it
     demand = with_separate_instances(demand, config)
     demand, unclear = with_chosen_domains(demand, config, ledger)
-    demand = flows.with_further_topics(demand, ledger, config)
-    demand, not_placed = placement.with_chosen_nodes(
-        demand, state, state.usage(), trial, checkpoint
-    )
-    return placed(demand, state, checkpoint), [*unclear, *not_placed]
+    demand, unread = chains.with_topics_of_outputs(demand, ledger, config)
+    return demand, [*unclear, *unread]
 
 
-def placed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -> AnyDemand:
-    """Return a demand, whose nodes are chosen, with all else that the generator adds."""
+def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -> AnyDemand:
+    """Return a prepared demand, whose nodes are chosen, with all else that the generator adds."""
     config, ledger = state.config, state.ledger
+    if demand.adds_claims:
+        moved = (
+            replace(item, held=_with_moved_services(item.held, state)) for item in demand.demanded
+        )
+        demand = replace(demand, demanded=tuple(moved))
+    if chains.reads_outputs(demand):
+        # again, because the nodes of listed applications may have been open
+        demand, _ = chains.with_topics_of_outputs(demand, ledger, config)
+        demand = chains.with_held_applications(demand, ledger, config)
     demand = carriers.with_implied_routes(demand, ledger, config)
     checkpoint()
     # before what depends on the connection: its lease, type, permission, quota and approval
@@ -75,6 +76,18 @@ def _without_impossible_routes(demand: AnyDemand, config: Config) -> AnyDemand:
         return not held.topics or not faults
 
     return replace(demand, demanded=tuple(filter(is_possible, demand.demanded)))
+
+
+def _with_moved_services(held: Held, state: State) -> Held:
+    if not isinstance(held, Application):
+        return held
+    # The moved services of a booked application stay on the booked nodes. Only a change of an
+    # override or of a definition moves them again, and not a further demand.
+    booked = state.ledger.application(held.id)
+    moved = replace(held, moved=booked.moved) if booked else held
+    if booked is None or not moved.has_same_definition_and_nodes(booked):
+        moved = with_overridden_nodes(held, state)
+    return moved
 
 
 # ---- the definition that a goal of the reference's action means by a number ----

@@ -62,7 +62,7 @@ def topic_faults(
                 continue
             # Only services that run before and after the demand count. If an application moves, a
             # connection may bring the application's output back to the old node.
-            staying = (key for key in _publishers(before, node, topic) if is_needed(after, key))
+            staying = (key for key, _ in publishers(before, node, topic) if is_needed(after, key))
             for other in islice(staying, 1):
                 yield item.fault(
                     f"topics[{index}].{'source' if route.reverse else 'target'}",
@@ -98,15 +98,15 @@ def _clashes_of_service(request: Demand, after: World, key: ServiceKey) -> Itera
         booked = after.ledger.booked_input(service.root, str(key.source), str(key.topic))
         further = bool(booked and booked.further)
     for name, topic in outputs(after.config, service, key, further=further).items():
-        publishers = (
+        published = (
             (f"{words(other)} already publishes this topic on", other)
-            for other in _publishers(after, key.node, topic, excluded=key)
+            for other, _ in publishers(after, key.node, topic, excluded=key)
         )
         connections = (
             (f"connection '{id}' already brings this topic to", None)
             for id in after.ledger.connections_bringing(key.node, topic)
         )
-        for clash, other in chain[tuple[str, ServiceKey | None]](publishers, connections):
+        for clash, other in chain[tuple[str, ServiceKey | None]](published, connections):
             remedy = _remedy(key, other, service, name, after.config)
             message = (
                 f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}"
@@ -114,15 +114,15 @@ def _clashes_of_service(request: Demand, after: World, key: ServiceKey) -> Itera
             yield fault(_field(request, key, service), message, code="conflict")
 
 
-def _publishers(
+def publishers(
     world: World, node: str, topic: str, *, excluded: ServiceKey | None = None
-) -> Iterator[ServiceKey]:
-    """Yield the keys of the needed instances on a node that publish ``topic``."""
+) -> Iterator[tuple[ServiceKey, str]]:
+    """Yield the keys of the needed instances on a node that publish ``topic``, and the output."""
     # The output patterns of the definitions tell which instances would publish the topic. So only
     # these are looked up, and not the outputs of all services on the node.
     for services in world.config.services.values():
         for service in services.values():
-            for pattern in service.outputs.values():
+            for name, pattern in service.outputs.items():
                 first, *others = map(re.escape, pattern.split("{instance}"))
                 expression = first + "(.+)" + r"\1".join(others) if others else first
                 match = re.fullmatch(expression, topic)
@@ -144,7 +144,7 @@ def _publishers(
                         and key != excluded
                         and is_needed(world, key)
                     ):
-                        yield key
+                        yield key, f"{service.name}.{name}"
 
 
 def _keys_called(

@@ -6,31 +6,39 @@ chosen if it fits. If it does not fit, the best other node that fits is chosen.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from heapq import nsmallest
 from math import fsum, inf
+from typing import TypeVar
 
 from demandops.base import strict_yaml
-from demandops.base.errors import Fault, suggestion
+from demandops.base.errors import Fault, Refused, suggestion
 from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
-from demandops.decide.placement.capacity import Room
+from demandops.decide.placement import capacity
+from demandops.decide.placement.capacity import Need, NoRoom, Usage
+from demandops.decide.planning.flows import instances
 from demandops.decide.planning.overrides import with_overridden_nodes
+from demandops.decide.planning.release_keys import is_needed
 from demandops.model.config import inventory
 from demandops.model.config.appdef import Place, Service
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
-from demandops.model.config.inventory import Node, Position
+from demandops.model.config.inventory import Node, Position, amount_of
 from demandops.model.demand.demand import Application, Item, Requirement
-from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World
+from demandops.model.release import ServiceKey
 
 _MOST_SHOWN = 5
-# After a booking failed on so many nodes, no other node is tried, because each trial takes time.
+# After an attempt failed on so many nodes, no other node is tried, because each attempt takes time.
 # The bound is a number and not a time, so every generator comes to the same end.
 MOST_TRIED = 20
 # The code of the fault if no node fits, but at least one node lacks only room. Such a demand may
 # wait.
 NO_ROOM = "no-room"
+
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,32 +72,66 @@ def shares(service: Service, app: Application, other: Application) -> bool:
     return service.scope == "topic" and identity == (other.appdef, other.node, other.own_version)
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """The choice of a node for one application, or for one of its services.
+@dataclass(slots=True)
+class Room:
+    """What is left while the applications of a demand are placed one after another.
 
-    ``claims`` are those that the application would get; the chosen node replaces the node in them.
-    ``suits`` returns whether the demand can be booked with the given application.
+    It only rules out nodes that are certainly full. The decision counts exactly.
     """
+
+    world: World
+    usage: Usage
+    # The nodes on which a demand gives something back itself are not ruled out.
+    given_back: Collection[str] = ()
+    # What was placed so far: the instances that begin to run, and how many at each node
+    started: set[ServiceKey] = field(default_factory=set)
+    placed: Counter[str] = field(default_factory=Counter)
+
+
+@dataclass(slots=True)
+class Choice:
+    """The choice of a node for one application, or for one of its services."""
 
     item: Item
     requirement: Requirement
-    world: World
     room: Room
-    claims: tuple[Claim, ...]
     service: Service | None = None
-    suits: Callable[[Application], bool] | None = None
     # Those that the demand gives, by node id. A position in the inventory has precedence.
     positions: Mapping[str, Position] = field(default_factory=dict)
+    # The refusals on nodes that were tried in vain
+    refused: dict[str, Refused] = field(default_factory=dict)
+    _starting: dict[ServiceKey, dict[str, int]] | None = None
 
     @property
     def config(self) -> Config:
-        return self.world.config
+        return self.room.world.config
 
     @property
     def app(self) -> Application:
         assert isinstance(self.item.held, Application)  # noqa: S101 - only these are placed
         return self.item.held
+
+    def on(self, chosen: Chosen) -> Item:
+        """Return the demanded application on a node, with a sentence that says why."""
+        what = f"application '{self.app.id}'"
+        what = f"service '{self.service.name}' of {what}" if self.service else what
+        placed = f"{what} is placed on {quoted(chosen.node)}, {chosen.why}"
+        held = on_node(self.app, chosen.node, self.service, self.room.world)
+        return replace(self.item, held=held, placed=(*self.item.placed, placed))
+
+    def first(self, attempt: Callable[[Chosen], _Result]) -> tuple[Chosen, _Result]:
+        """Return the best node on which the attempt is not refused, and what the attempt returns.
+
+        If there is none, raise Refused with what nodes lack.
+        """
+        for chosen in self.candidates():
+            try:
+                return chosen, attempt(chosen)
+            except Refused as refusal:
+                self.refused[chosen.node] = refusal
+            if len(self.refused) == MOST_TRIED:
+                break
+        raise Refused([self.none_fits()])
 
     def fits(self, node: str) -> bool:
         """Return whether a node meets the requirement, accepts services and permits this demand."""
@@ -99,115 +141,137 @@ class Choice:
         return not self._closed(entry) and self._is_permitted(entry)
 
     def candidates(self) -> Iterator[Chosen]:
-        """Yield the nodes that fit, have room and pass :attr:`suits`, the best first."""
+        """Yield the nodes that fit and seem to have room, the best first."""
         fitting = self._fitting()
-        centre = self._centre()
-        fitting.sort(key=lambda node: self._rank(node, centre))
+        rank = self._rank()
+        order = self.config.repo_settings.placement
         skipped: dict[str, None] = {}
-        tried = 0
-        least: Mapping[str, int] | None = None
-        # The checks that cost least come first. A trial of the whole booking comes last.
-        for node in fitting:
-            if node.capacity is not None and least is None:
-                least = self.room.least(self._claims_on(node), self._name)
-            if node.capacity is not None and self.room.is_full(node, least or {}):
+        for node in sorted(fitting, key=rank):
+            if self._is_full(node):
                 skipped["that have room"] = None
-            elif not self._is_permitted(node):
+                continue
+            if not self._is_permitted(node):
                 skipped["that its requesters may use"] = None
-            elif self._shortage(node):
-                skipped["that have room"] = None
-            elif self.suits and not self.suits(
-                on_node(self.app, node.id, self.service, self.world)
-            ):
-                skipped["on which the demand can be booked"] = None
-                tried += 1
-                if tried == MOST_TRIED:
-                    return
-            else:
-                choose = self.config.repo_settings.placement
-                merit = f"the one with the {'most' if choose == 'pack' else 'fewest'} applications"
-                if self._is_home(node):
-                    merit = "the node of its application"
-                elif choose == "nearest" and self._distance(node, centre) < inf:
-                    merit = "the nearest to its sources"
-                only = f", counting only nodes {' and '.join(skipped)}" if skipped else ""
-                why = f"{merit} among {len(fitting)} nodes that fit{only}"
-                yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
-
-    def chosen(self, node: str, why: str) -> Chosen | None:
-        # :attr:`suits` is not asked here.
-        entry = self.config.nodes.get(node)
-        if entry is None or not self.fits(node) or self._shortage(entry):
-            return None
-        return Chosen(node, why)
+                continue
+            merit = f"the one with the {'most' if order == 'pack' else 'fewest'} applications"
+            if self._is_home(node):
+                merit = "the node of its application"
+            elif order == "nearest" and rank(node)[1] < inf:
+                merit = "the nearest to its sources"
+            only = f", counting only nodes {' and '.join(skipped)}" if skipped else ""
+            why = f"{merit} among {len(fitting)} nodes that fit{only}"
+            yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
+            full = self._shortage(node)  # as the decision counted on the node
+            skipped["that have room" if full else "on which the demand can be booked"] = None
 
     def nodes(self) -> list[str]:
         # The full ones count too.
         return [node.id for node in self._fitting() if self._is_permitted(node)]
+
+    def has_room(self, node: str) -> bool:
+        entry = self.config.nodes.get(node)
+        return entry is not None and self.fits(node) and not self._is_full(entry)
+
+    def take(self, node: str) -> None:
+        """Count the application or service on a node, for the choices that follow."""
+        self.room.usage = self.room.usage.plus(self._growth(node))
+        self.room.started |= {replace(key, node=node) for key in self._starting or ()}
+        self.room.placed[node] += 1
+
+    def _growth(self, node: str) -> dict[Need, int]:
+        """Return what the instances that would begin to run on ``node`` request at least."""
+        world, host = self.room.world, self.config.host_of(node)
+        # The same on each node, so it is found only once, unless an override may move a service
+        if self._starting is None or any(override.node for override in world.overrides):
+            app = on_node(self.app, node, self.service, world)
+            overridden = [each.replicas for each in world.overrides if each.replicas is not None]
+            self._starting = {
+                key: {
+                    name: amount_of(quantity) * min([service.scaling.least, *overridden])
+                    for name, quantity in service.requests.items()
+                }
+                for service in self.config.services.get(app.appdef, {}).values()
+                if service.requests and not service.at_source and not service.nodes
+                if self.service in (None, service)
+                for key in instances(app, service)
+                if key.node == node
+            }
+        growth = dict[Need, int]()
+        for key, amounts in self._starting.items():
+            shared = None if key.application else replace(key, node=node)
+            if shared and (shared in self.room.started or is_needed(world, shared)):
+                continue
+            for resource, amount in amounts.items():
+                growth[host, resource] = growth.get((host, resource), 0) + amount
+        return growth
+
+    def _is_full(self, node: Node) -> bool:
+        if node.capacity is None or node.id in self.room.given_back:
+            return False
+        return any(capacity.exceeded(self.room.usage, self._growth(node.id), self.config))
+
+    def _shortage(self, node: Node) -> list[str]:
+        """Return, in words, each resource of which a node has too little; empty if it has room."""
+        refusal = self.refused.get(node.id)
+        if refusal is not None:
+            full = refusal.full if isinstance(refusal, NoRoom) else {}
+            return full.get(self.config.host_of(node.id), [])
+        if not self._is_full(node):
+            return []
+        growth, config = self._growth(node.id), self.config
+        return [excess for _, excess in capacity.excesses(self.room.usage, growth, config)]
 
     def _fitting(self) -> list[Node]:
         required, config = self.requirement, self.config
         traits = (*((name,) for name in required.capabilities), *required.label_pairs)
         # Of the nodes with each required trait, only the shortest list is searched.
         pools = [config.nodes_with.get(trait, ()) for trait in traits]
-        return [
+        pool = min((config.nodes_by_role.get(required.role, ()), *pools), key=len)
+        role, wanted = required.role, {*required.capabilities}
+        more = required.labels or required.properties
+        return [  # there may be thousands, so what is cheap to see comes first
             node
-            for node in min((config.nodes_by_role.get(required.role, ()), *pools), key=len)
-            if not any(lacks(node, required)) and not self._closed(node)
-        ]
-
-    def _shortage(self, node: Node) -> list[str]:
-        """Return, in words, each resource of which a node has too little; empty if it has room."""
-        if node.capacity is None:
-            return []
-        return self.room.lacks(self._claims_on(node), node.id, self._name)
-
-    @property
-    def _name(self) -> str:
-        return self.service.name if self.service else ""
-
-    def _claims_on(self, node: Node) -> list[Claim]:
-        return [
-            replace(claim, held=on_node(claim.application, node.id, self.service, self.world))
-            for claim in self.claims
+            for node in pool
+            if not self._closed(node)
+            and (not role or node.type == role)
+            and not wanted.difference(node.capabilities)
+            and not (more and any(lacks(node, required)))
         ]
 
     def _is_home(self, node: Node) -> bool:
         # A service on its application's node needs no connection to it.
         return self.service is not None and node.id == self.app.node
 
-    def _rank(self, node: Node, centre: Position | None) -> tuple[bool, float, float, str]:
-        distance = self._distance(node, centre)
-        booked = self.world.ledger.applications_on.get(node.id) or 0
-        booked += self.room.newly_placed[node.id]
-        away = not self._is_home(node)
-        # The id comes last, so that every generator and every replay chooses the same node.
-        match self.config.repo_settings.placement:
-            case "spread":
-                return away, booked, distance, node.id
-            case "pack":
-                return away, -booked, distance, node.id
-        return away, distance, booked, node.id
-
-    def _distance(self, node: Node, centre: Position | None) -> float:
-        position = self._position(node.id)
-        if centre is None or position is None:
-            return inf
-        # Squared, because every machine computes this alike.
-        return (position.x - centre.x) ** 2 + (position.y - centre.y) ** 2
-
-    def _centre(self) -> Position | None:
+    def _rank(self) -> Callable[[Node], tuple[bool, float, float, str]]:
+        """Return the order of nodes, as a key to sort by."""
+        positions, order = self.positions, self.config.repo_settings.placement
         # the middle of the sources whose position is known
         sources = sorted({topic.source for _, topic in self.app.all_inputs()})
-        placed = [at for source in sources if (at := self._position(source))]
-        if not placed:
-            return None
-        x, y = (fsum(getattr(at, axis) for at in placed) / len(placed) for axis in "xy")
-        return Position(x=x, y=y)
+        known = [self.config.nodes.get(source) for source in sources]
+        placed = [
+            at
+            for source, node in zip(sources, known, strict=True)
+            if (at := (node.position if node else None) or positions.get(source))
+        ]
+        x, y = (fsum(getattr(at, axis) for at in placed) / (len(placed) or 1) for axis in "xy")
+        applications_on, placed_on = self.room.world.ledger.applications_on, self.room.placed
+        home = self.app.node
+        is_service = self.service is not None
 
-    def _position(self, node: str) -> Position | None:
-        entry = self.config.nodes.get(node)
-        return (entry.position if entry else None) or self.positions.get(node)
+        def rank(node: Node) -> tuple[bool, float, float, str]:
+            id, at = node.id, node.position
+            if at is None and positions:
+                at = positions.get(id)
+            # Squared, because every machine computes this alike.
+            distance = (at.x - x) ** 2 + (at.y - y) ** 2 if at and placed else inf
+            booked = (applications_on.get(id) or 0) + placed_on[id]
+            away = not (is_service and id == home)
+            # The id comes last, so that every generator and every replay chooses the same node.
+            if order == "nearest":
+                return away, distance, booked, id
+            return away, -booked if order == "pack" else booked, distance, id
+
+        return rank
 
     def _closed(self, node: Node) -> str:
         if node.drained:
@@ -218,36 +282,39 @@ class Choice:
         return permission.may_place(self.item, self.app.appdef, node.id, self.config)
 
     def none_fits(self) -> Fault:
-        """Return the fault if no node fits: what nodes lack, first those that lack the least."""
+        """Return the fault if no node fits: why, beginning with the nodes that nearly fit."""
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")
-        centre, code = self._centre(), "no-node"
+        rank, codes = self._rank(), set[str]()
         misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
         places = {self.config.place_of(NODES_FILE): None}
         for node in self.config.nodes_by_role.get(self.requirement.role, ()):
             missing = list(lacks(node, self.requirement))
             reasons = [f"lacks {joined(missing)}"] if missing else []
             reasons += filter(None, [self._closed(node)])
+            # What lacks nothing comes first: it is only full, or a rule is in the way.
+            lacking = len(missing) + len(reasons) - bool(missing)
             if not missing and node.id not in self.config.domain_of:
                 places[self.config.place_of(DOMAINS_FILE)] = None
             if not reasons and not self._is_permitted(node):
                 domain = self.config.domain_of[node.id].name
                 reasons.append(f"is in access domain '{domain}', which does not permit this demand")
                 places[self.config.place_of(DOMAINS_FILE)] = None
-            elif not reasons and (shortage := self._shortage(node)):
-                reasons, code = shortage, NO_ROOM
+            elif not reasons and (reasons := self._shortage(node)):
+                codes.add(NO_ROOM)
             elif not reasons:
-                reasons.append("meets the requirement, but the demand would be refused there")
-            text = f"'{node.id}' {joined(reasons)}"
-            count = len(missing) + len(reasons) - bool(missing)
-            misses.append((count, self._rank(node, centre), text))
-        shown = [text for _, _, text in sorted(misses)[:_MOST_SHOWN]]
+                codes.add("no-node")  # more room alone would not help
+                refusal = self.refused.get(node.id)
+                why = f": {refusal.faults[0].message}" if refusal else ""
+                reasons = [f"meets the requirement, but the demand would be refused there{why}"]
+            misses.append((lacking, rank(node), f"'{node.id}' {joined(reasons)}"))
+        shown = [text for *_, text in nsmallest(_MOST_SHOWN, misses)]
         hidden = len(misses) - len(shown)
         more = [f"{hidden} more {'are' if hidden > 1 else 'is'} not shown"] if hidden else []
         message = f"no node fits: {'; '.join([*shown, *more]) or 'the inventory has no node'}"
         less = f"change 'place' in {self.service.file}" if self.service else "ask for less"
         message += f"; {less}, or ask for a change of {' or '.join(places)}"
-        return self._fault(message, code)
+        return self._fault(message, NO_ROOM if codes == {NO_ROOM} else "no-node")
 
     def _fault(self, message: str, code: str) -> Fault:
         if self.service is None:

@@ -7,21 +7,20 @@ definition says how much. A shared service counts once. Communication clients re
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 
 from rpds import HashTrieMap
 
-from demandops.base.errors import Fault, Refused, fault
-from demandops.base.naming import Subject, SubjectKind
+from demandops.base.errors import Refused, fault
+from demandops.base.naming import SubjectKind
 from demandops.decide.planning import release_keys
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.config.inventory import Node, amount_of, amount_text
-from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import ClaimChange, World
-from demandops.model.release import Release, ServiceKey, ServiceRelease, most_replicas
+from demandops.model.release import Release, ServiceRelease, most_replicas
 
 # The ids of a node and of a resource, as in ``("edge", "cpu")``.
 Need = tuple[str, str]
@@ -54,14 +53,14 @@ def whole_usage(world: World) -> Usage:
     for subject in world.ledger.claims:
         if subject.kind is SubjectKind.APPLICATION:
             keys |= dict.fromkeys(release_keys.keys_of(world, subject))
-    return Usage().plus(_requests(_plan_leniently(world, keys), world.config))
+    return Usage().plus(requests(_plan_leniently(world, keys), world.config))
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
     if not config.limits_capacity:
         return {}
-    change = _requests(after, config)
-    change.subtract(_requests(before, config))
+    change = requests(after, config)
+    change.subtract(requests(before, config))
     return {need: amount for need, amount in change.items() if amount}
 
 
@@ -83,7 +82,7 @@ def _plan_leniently(world: World, keys: Iterable[ReleaseKey]) -> Plans:
     return planned
 
 
-def _requests(plans: Plans, config: Config) -> Counter[Need]:
+def requests(plans: Plans, config: Config) -> Counter[Need]:
     total: Counter[Need] = Counter()
     for release in plans.values():
         if isinstance(release, ServiceRelease) and release.service.requests:
@@ -94,130 +93,45 @@ def _requests(plans: Plans, config: Config) -> Counter[Need]:
     return total
 
 
-def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
-    """Yield (node, reason) for each resource of which a node has too little for the growth."""
-    for (id, resource), amount in sorted(grown.items()):
-        node = config.nodes.get(id)
-        most = node.most(resource) if node else None
-        used = usage.of(id, resource)
+def exceeded(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[Need, int]]:
+    """Yield (need, capacity) for each resource of which a node has too little for the growth."""
+    for need, amount in grown.items():
+        node = config.nodes.get(need[0])
+        most = node.most(need[1]) if node else None
         # Only growth is refused. If a person lowers a capacity below what is used, no demand is
         # stopped that adds nothing there.
-        if most is None or amount <= 0 or used + amount <= most:
-            continue
-        free, capacity = (amount_text(each, resource) for each in (max(most - used, 0), most))
-        asked = amount_text(amount, resource)
-        yield id, f"has {free} of {capacity} {resource} free, but {asked} is asked for"
+        if most is not None and amount > 0 and usage.of(*need) + amount > most:
+            yield need, most
 
 
-def faults(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[Fault]:
-    for node, excess in excesses(usage, grown, config):
-        message = (
-            f"'{node}' {excess}; choose another node, release something first, or ask "
-            f"for a change of {config.place_of(NODES_FILE)}"
-        )
-        yield fault("", message, code="capacity")
+def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
+    """Yield (node, reason) for each resource of which a node has too little for the growth."""
+    for need, most in sorted(exceeded(usage, grown, config)):
+        resource, left = need[1], max(most - usage.of(*need), 0)
+        free, capacity, asked = (amount_text(n, resource) for n in (left, most, grown[need]))
+        yield need[0], f"has {free} of {capacity} {resource} free, but {asked} is asked for"
 
 
-class Room:
-    """The room that nodes have left while the applications of a demand are placed one by one.
+class NoRoom(Refused):
+    """Raised if a demand asks for more than nodes have; ``full`` says of what, by node."""
 
-    The claims in ``given_back`` count as released, so the room that they took is free.
-    ``checkpoint`` is called before each step that plans releases; it may raise an exception.
-    """
+    def __init__(self, usage: Usage, grown: Mapping[Need, int], config: Config) -> None:
+        self.full: dict[str, list[str]] = {}
+        faults = []
+        for node, excess in excesses(usage, grown, config):
+            self.full.setdefault(node, []).append(excess)
+            message = (
+                f"'{node}' {excess}; choose another node, release something first, or ask "
+                f"for a change of {config.place_of(NODES_FILE)}"
+            )
+            faults.append(fault("", message, code="capacity"))
+        super().__init__(faults)
 
-    def __init__(
-        self,
-        world: World,
-        usage: Usage,
-        given_back: Iterable[Claim] = (),
-        checkpoint: Callable[[], None] = lambda: None,
-    ) -> None:
-        self._world, self._usage, self._checkpoint = world, usage, checkpoint
-        self._least: dict[tuple[Subject, str], dict[str, int]] = {}
-        # How many applications and services were placed on each node so far.
-        self.newly_placed: Counter[str] = Counter()
-        self.book((claim for claim in given_back if claim.is_on_application), give_back=True)
 
-    def take(self, claim: Claim) -> None:
-        self.newly_placed[claim.application.node] += 1
-        self.book([claim])
-
-    def book(self, claims: Iterable[Claim], *, give_back: bool = False) -> None:
-        if self._world.config.limits_capacity:
-            self._world, grown = self._after(claims, give_back=give_back)
-            self._usage = self._usage.plus(grown)
-
-    def lacks(self, claims: Sequence[Claim], node: str, service: str) -> list[str]:
-        """Return, in words, the resources of which a node has too little for an application.
-
-        ``claims`` are those to book for the application on ``node``. If ``service`` is not empty,
-        only this service is placed there. An application that cannot be planned lacks nothing.
-        """
-        host = self._world.config.host_of(node)
-        least = {(host, resource): most for resource, most in self.least(claims, service).items()}
-        short = [excess for _, excess in excesses(self._usage, least, self._world.config)]
-        if short:
-            return short
-        # What the application needs is tried, not estimated: it is booked in memory and planned.
-        _, grown = self._after(claims)
-        exceeded = excesses(self._usage, grown, self._world.config)
-        return [excess for id, excess in exceeded if id == host]
-
-    def is_full(self, node: Node, needed: Mapping[str, int]) -> bool:
-        host = self._world.config.host_of(node.id)
-        return any(
-            most is not None and self._usage.of(host, resource) + amount > most
-            for resource, amount in needed.items()
-            for most in [node.most(resource)]
-        )
-
-    def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
-        """Return what an application, or its ``service``, requests at least of its node.
-
-        Services that it shares do not count, nor do services with a node of their own.
-        """
-        subject, world = claims[0].subject, self._world
-        # Planning for each node takes long. This amount is the same on all nodes, so it is planned
-        # once and rules out full nodes. It is unknown if overrides may make it depend on the node.
-        if any(each.node or each.deny or each.replicas is not None for each in world.overrides):
-            return {}
-        if (subject, service) not in self._least:
-            after, _ = self._booked(claims)
-            apart = claims[0].application.services
-            keys = [
-                key
-                for key in release_keys.keys_of_claims(after, claims)
-                if isinstance(key, ServiceKey)
-                and key.application is not None
-                and (key.service == service if service else key.service not in apart)
-            ]
-            total: Counter[str] = Counter()
-            requests = _requests(_plan_leniently(after, keys), after.config)
-            for (_, resource), amount in requests.items():
-                total[resource] += amount
-            self._least[subject, service] = dict(total)
-        return self._least[subject, service]
-
-    def _booked(
-        self, claims: Iterable[Claim], *, give_back: bool = False
-    ) -> tuple[World, list[ClaimChange]]:
-        ledger, changes = self._world.ledger, list[ClaimChange]()
-        for claim in claims:
-            change = ClaimChange(ledger.get(claim.key), None if give_back else claim)
-            ledger = ledger.replace(claim.key, change.after)
-            changes.append(change)
-        return replace(self._world, ledger=ledger), changes
-
-    def _after(
-        self, claims: Iterable[Claim], *, give_back: bool = False
-    ) -> tuple[World, Mapping[Need, int]]:
-        """Return the world after the booking, and what services then request in addition."""
-        self._checkpoint()
-        after, changes = self._booked(claims, give_back=give_back)
-        try:
-            return after, growth_by(self._world, after, changes)
-        except Refused:  # admission reports why the application cannot run
-            return after, {}
+def refuse_excess(usage: Usage, grown: Mapping[Need, int], config: Config) -> None:
+    refusal = NoRoom(usage, grown, config)
+    if refusal.full:
+        raise refusal
 
 
 def overcommitted(world: World, usage: Usage) -> Iterator[tuple[Node, str]]:

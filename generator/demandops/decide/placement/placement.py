@@ -1,78 +1,96 @@
-"""Placement: nodes for those applications and services for which a demand names no node.
+"""Placement: a search for nodes, with the decision itself as the test of each node.
 
-The nodes are chosen before the booking, and only from the configuration and the claims at one
-commit. A claim records a chosen node in the same field as a node that the demand names, so later
-stages treat both alike.
+It chooses nodes for those applications and services for which a demand names none. A claim records
+a chosen node in the same field as a node that the demand names, so booking and planning treat both
+alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime, timezone
+from typing import Generic, TypeVar
 
-from demandops.base.errors import Fault
+from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.base.quoting import quoted
-from demandops.decide.admission import permission
+from demandops.decide.admission import admission, permission
 from demandops.decide.placement import candidates
-from demandops.decide.placement.candidates import Choice, Chosen, joined, lacks, requirement_of
-from demandops.decide.placement.capacity import Room, Usage
-from demandops.decide.planning.overrides import with_overridden_nodes
+from demandops.decide.placement.candidates import (
+    NO_ROOM,
+    Choice,
+    Chosen,
+    Room,
+    joined,
+    lacks,
+    requirement_of,
+)
+from demandops.decide.placement.capacity import NoRoom, Usage
+from demandops.decide.state import State
 from demandops.model.config.appdef import Service
-from demandops.model.demand.demand import AnyDemand, Application, Demand, Item
-from demandops.model.ledger.claim import Claim, demand_id
+from demandops.model.demand.demand import Application, Demand, Item, Requirement
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World
 
-# The booking time of a claim that is not booked yet. It is later than any other booking time, as
-# that of a new claim is, so ``merge: latest`` takes its parameters.
-_LAST = datetime.max.replace(tzinfo=timezone.utc)
+# The time of a claim that is judged but not booked
+_NEVER = datetime.max.replace(tzinfo=timezone.utc)
 
-# Returns whether a request can be booked. All its applications have a node already.
-Trial = Callable[[Demand], bool]
+_Result = TypeVar("_Result")
 
-# Stands for the faults of a demand whose fixed part is refused; the caller knows these faults.
-_NOWHERE = Fault("no-node", "", "is refused whatever nodes are chosen")
+# Carries out a request, in which some applications may be missing, together with the faults of the
+# search: returns the decision so far, or raises Refused.
+Attempt = Callable[[Demand, Sequence[Fault]], _Result]
+
+# The codes of faults that might not occur if other nodes were chosen for the demand
+_BY_NODE = frozenset(
+    ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
+)
+# How many bookings one demand, or one drain of a node, may attempt while nodes are looked for. Each
+# attempt books all that is placed so far. So the attempts of one demand together may also book no
+# more items than the largest demand may list.
+MOST_ATTEMPTS = 64
 
 
-def with_chosen_nodes(
-    request: AnyDemand,
-    world: World,
-    usage: Usage,
-    trial: Trial | None,
-    checkpoint: Callable[[], None],
-) -> tuple[AnyDemand, list[Fault]]:
-    """Return the request with a node for each application and service to place, and the faults.
+def search(
+    request: Demand, state: State, attempt: Attempt[_Result], checkpoint: Callable[[], None]
+) -> _Result:
+    """Return what the attempt returns with the first nodes with which it is not refused.
 
     A booked application or service stays on its node if the node still fits. If other demands hold
     it too, it stays even on a node that is drained or no longer permitted. Any other application or
-    service gets the first node that fits and has room. Finally, services move to the nodes that
-    overrides name.
+    service gets the first node that fits, has room and is not refused. The first attempt has the
+    best node for each. Only if it is refused for a reason that other nodes may not give, the
+    applications and services are placed one by one, each with attempts of its own.
 
-    If ``trial`` is given, a node is chosen only if ``trial`` returns ``True`` for the request with
-    this node. It is not called for a node on which the application or service is booked already,
-    nor for one on which another application has a service to share. ``checkpoint`` is called at
-    each step; it may raise an exception to end the search.
+    ``checkpoint`` is called at each step; it may raise an exception to end the search.
     """
-    if not request.adds_claims:
-        return request, []
-    faults: list[Fault] = []
-    if needs_placement(request, world):
-        request, faults = _placed(request, world, usage, trial, checkpoint)
-    demanded = list(request.demanded)
-    for index, item in enumerate(demanded):
-        app = item.held
-        if isinstance(app, Application):
-            # The moved services of a booked application stay on the booked nodes. Only a change of
-            # an override or of a definition moves them again, and not a further demand.
-            booked = world.ledger.application(app.id)
-            moved = replace(app, moved=booked.moved) if booked else app
-            if booked is None or not moved.has_same_definition_and_nodes(booked):
-                moved = with_overridden_nodes(app, world)
-            demanded[index] = replace(item, held=moved)
-    return replace(request, demanded=tuple(demanded)), faults
+    if not request.adds_claims or not _needs_placement(request, state):
+        return attempt(request, ())
+    places = _Places(request, state, attempt, checkpoint)
+    placed, faults = places.placed()
+    try:
+        return attempt(placed, faults)
+    except Refused as refusal:
+        full = refusal.full.keys() if isinstance(refusal, NoRoom) else ()
+        apps = [item.held for item in placed.demanded if isinstance(item.held, Application)]
+        nodes = {state.config.host_of(node) for app in apps for node in app.chosen_nodes}
+        elsewhere = nodes & {*full} or all(each.code in _BY_NODE for each in refusal.faults)
+        if faults or not elsewhere:
+            raise
+        first = refusal
+    try:
+        return places.one_by_one()
+    except OverBudget as spent:
+        # with the faults of the first refusal: they tell the requester what to change
+        raise Refused([fault("", str(spent), code="too-large"), *first.faults]) from None
+    except Refused as refusal:
+        lacks_room = isinstance(first, NoRoom) and all(f.code == NO_ROOM for f in refusal.faults)
+        raise refusal if lacks_room else first from None
 
 
-def needs_placement(request: Demand, world: World) -> bool:
+def _needs_placement(request: Demand, world: World) -> bool:
     # A service with a node of its own, in the request or in the ledger, needs its node checked.
     apps = (item.held for item in request.demanded if isinstance(item.held, Application))
     return any(
@@ -89,83 +107,205 @@ def _services_to_place(app: Application, world: World) -> list[Service]:
     return [service for service in services if service.place and service.name not in app.named]
 
 
-def _placed(
-    request: AnyDemand,
-    world: World,
-    usage: Usage,
-    trial: Trial | None,
-    checkpoint: Callable[[], None],
-) -> tuple[AnyDemand, list[Fault]]:
-    ledger, faults = world.ledger, list[Fault]()
-    kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
-    room = Room(world, usage, [*ledger.claims_of_demand(request.demand), *kept], checkpoint)
-    demanded = list(request.demanded)
-    for index, item in enumerate(demanded):
-        if isinstance(item.held, Application):
-            services = {service.name: "" for service in _services_to_place(item.held, world)}
-            services |= {name: item.held.services[name] for name in item.held.named}
-            held = replace(item.held, services=services)
-            demanded[index] = replace(item, held=held)
-    # What leaves no choice is tried first and alone. If that is refused, no node helps.
-    fixed = tuple(
-        item
-        for item in demanded
-        if not isinstance(item.held, Application)
-        or (item.held.place is None and all(item.held.services.values()))
-    )
-    if trial is not None and fixed and not trial(replace(request, demanded=fixed)):
-        return request, [_NOWHERE]
-    on_named_nodes = [
-        item for item in demanded if isinstance(item.held, Application) and item.held.place is None
-    ]
-    for item in on_named_nodes:
-        room.take(_claim(request, item))
+class _Places(Generic[_Result]):
+    """The nodes of one request's applications and services, chosen one after another."""
 
-    def suits(index: int) -> Callable[[Application], bool] | None:
-        if trial is None:
-            return None
+    def __init__(
+        self,
+        request: Demand,
+        state: State,
+        attempt: Attempt[_Result],
+        checkpoint: Callable[[], None],
+    ) -> None:
+        self._state, self._attempt, self._checkpoint = state, attempt, checkpoint
+        demanded = list(request.demanded)
+        for index, item in enumerate(demanded):
+            if isinstance(item.held, Application):
+                services = {service.name: "" for service in _services_to_place(item.held, state)}
+                services |= {name: item.held.services[name] for name in item.held.named}
+                demanded[index] = replace(item, held=replace(item.held, services=services))
+        self._request = replace(request, demanded=tuple(demanded))
+        self._demanded, self._faults = demanded, list[Fault]()
+        self._room = self._whole_room()
+        self._one_by_one = False
+        self._attempts = self._items = 0
+        # what was tried last with success, and what the attempt returned
+        self._last: tuple[tuple[Item, ...], _Result] | None = None
 
-        def can_be_booked(app: Application) -> bool:
-            items = list(demanded)
-            items[index] = replace(items[index], held=app)
-            # Applications that get their node later are left out.
-            placed = (
-                each for each in items if not isinstance(each.held, Application) or each.held.node
+    def _whole_room(self) -> Room:
+        request, ledger = self._request, self._state.ledger
+        kept = (each for subject in request.subjects() for each in ledger.kept_claims(subject))
+        own = [*ledger.claims_of_demand(request.demand), *kept]
+        nodes = {node for c in own if c.is_on_application for node in c.application.needed_nodes()}
+        apps = (item.held for item in request.demanded if isinstance(item.held, Application))
+        placed = Counter(app.node for app in apps if app.node)
+        return Room(self._state, self._state.usage(), nodes, placed=placed)
+
+    def placed(self) -> tuple[Demand, list[Fault]]:
+        """Return the request with the best node for each application and service, and the faults.
+
+        The choices follow one another. What is chosen first is not changed for the sake of what
+        comes later. Services come after all applications, because a service runs on its
+        application's node if it can.
+        """
+        for index, item in enumerate(self._demanded):
+            if isinstance(item.held, Application) and item.held.place is not None:
+                with self._faults_noted():
+                    self._place_application(index, item, item.held, item.held.place)
+        for index, item in enumerate(self._demanded):
+            if isinstance(item.held, Application) and item.held.node:
+                for service in self._services_left(index, item, item.held):
+                    with self._faults_noted():
+                        self._place_service(index, service)
+        return replace(self._request, demanded=tuple(self._demanded)), self._faults
+
+    @contextmanager
+    def _faults_noted(self) -> Iterator[None]:
+        self._checkpoint()
+        try:
+            yield
+        except Refused as refusal:
+            if self._one_by_one:
+                raise
+            self._faults += refusal.faults
+
+    def one_by_one(self) -> _Result:
+        """Return what the attempt returns for nodes that are attempted one after another."""
+        self._demanded, self._room = list(self._request.demanded), self._whole_room()
+        self._one_by_one = True
+        # What leaves no choice is tried first and alone. If that is refused, no node helps.
+        fixed = tuple(
+            item
+            for item in self._demanded
+            if not isinstance(item.held, Application)
+            or (item.held.place is None and all(item.held.services.values()))
+        )
+        if fixed:
+            self._last = fixed, self._tried(fixed)
+        request, _ = self.placed()
+        if self._last and self._last[0] == request.demanded:
+            return self._last[1]
+        return self._tried(request.demanded)
+
+    def _place_application(
+        self, index: int, item: Item, app: Application, place: Requirement
+    ) -> None:
+        choice = self._choice(item, place)
+        if app.node:
+            # ``node`` and ``place`` together are a check of the named node, and no preference.
+            node = choice.config.nodes.get(app.node)
+            # admission reports an unknown node
+            if node and (lacking := list(lacks(node, place))):
+                message = (
+                    f"{quoted(app.node)} lacks {joined(lacking)}; name another node, or leave out "
+                    "one of the fields 'node' and 'place'"
+                )
+                raise Refused([item.fault("place", message, code="no-node")])
+            self._demanded[index] = replace(item, held=replace(app, place=None))
+            return
+        self._take(index, choice, _booked(choice, self._request.demand))
+
+    def _services_left(self, index: int, item: Item, app: Application) -> list[Service]:
+        """Return the services that still need a node; those that are named or booked get theirs."""
+        request, ledger, config = self._request, self._state.ledger, self._state.config
+        claims, first = ledger.claims_on(app.subject), self._booked_as(app)
+        if first and (request.is_reference or _of_another(claims, request.demand)):
+            # What others hold stays where it is. So does what a goal of the reference's action
+            # holds: its connections are those that it lists, and would not follow.
+            for name in app.named:
+                node = first.chosen_node(name)
+                if node != app.services[name]:
+                    message = (
+                        f"{quoted(app.services[name])} contradicts an existing claim of "
+                        f"{', '.join(claims[0].requesters)}: service {name} of '{app.id}' is on "
+                        f"node '{node}'; name node '{node}', or use another application id"
+                    )
+                    self._faults.append(item.fault(f"services.{name}", message, code="conflict"))
+            # A service that the claim does not place runs with its application. To name that node
+            # changes nothing, and is not recorded, because all claims on an application say the
+            # same.
+            named = tuple(name for name in app.named if name in first.services)
+            held = replace(app, services=first.services, named=named)
+            self._demanded[index] = replace(item, held=held)
+            return []
+        services = config.services.get(app.appdef, {})
+        for name in app.named:
+            wanted, definition = config.nodes.get(app.services[name]), services.get(name)
+            if wanted and definition and (lacking := [*lacks(wanted, requirement_of(definition))]):
+                message = (
+                    f"{quoted(wanted.id)} lacks {joined(lacking)}, which the service requires "
+                    f"('place' in {definition.file}); name another node, or name none for this "
+                    "service"
+                )
+                self._faults.append(item.fault(f"services.{name}", message, code="no-node"))
+        # A node that the demand named for a service and names no longer does not stay.
+        no_longer_named = {
+            name
+            for claim in claims
+            if claim.demand == request.demand
+            for name in claim.application.named
+        }
+        stay = {*services} - {*app.services} - no_longer_named
+        booked = first.services if first else {}
+        kept = {name: node for name, node in booked.items() if name in stay}
+        self._demanded[index] = replace(item, held=replace(app, services=kept | {**app.services}))
+        return _services_to_place(app, self._state)
+
+    def _booked_as(self, app: Application) -> Application | None:
+        booked = self._state.ledger.application(app.id)
+        return booked if booked and booked.appdef == app.appdef else None
+
+    def _place_service(self, index: int, service: Service) -> None:
+        choice = self._choice(self._demanded[index], requirement_of(service), service)
+        first = self._booked_as(choice.app)
+        here = first.services.get(service.name, "") if first else ""
+        shared = _shared_node(choice.app, service, self._state)
+        chosen = None
+        if here and (here == shared or choice.fits(here)):
+            chosen = Chosen(here, "where it is booked already")
+        elif shared and choice.has_room(shared):
+            chosen = Chosen(shared, "where the service already runs for this topic")
+        self._take(index, choice, chosen)
+
+    def _choice(
+        self, item: Item, requirement: Requirement, service: Service | None = None
+    ) -> Choice:
+        return Choice(item, requirement, self._room, service, self._request.positions)
+
+    def _take(self, index: int, choice: Choice, chosen: Chosen | None) -> None:
+        """Put the application or service on ``chosen``, or else on the first node that will do."""
+
+        def attempt(chosen: Chosen) -> None:
+            if self._one_by_one:
+                demanded = [*self._demanded]
+                demanded[index] = choice.on(chosen)
+                # Applications that get their node later are left out.
+                placed = tuple(
+                    each
+                    for each in demanded
+                    if not isinstance(each.held, Application) or each.held.node
+                )
+                self._last = placed, self._tried(placed)
+
+        if chosen is None:
+            chosen, _ = choice.first(attempt)
+            choice.take(chosen.node)
+        self._demanded[index] = choice.on(chosen)
+
+    def _tried(self, demanded: tuple[Item, ...]) -> _Result:
+        request = replace(self._request, demanded=demanded)
+        self._attempts += 1
+        self._items += admission.items_of(request)
+        most = self._state.config.repo_settings.limits.demand_items
+        if self._attempts > MOST_ATTEMPTS or self._items > most:
+            raise OverBudget(
+                "too many nodes would have to be tried for this demand; name a node for each "
+                "application, or split the demand"
             )
-            return trial(replace(request, demanded=tuple(placed)))
-
-        return can_be_booked
-
-    positions = request.positions
-    # The choices follow one another. What is chosen first is not changed for the sake of what comes
-    # later, and after the first failure no more is tried.
-    for index, item in enumerate(demanded):
-        if isinstance(item.held, Application) and item.held.place is not None:
-            if faults and trial is not None:
-                return request, faults
-            checkpoint()
-            claims = (_claim(request, item),)
-            place = item.held.place
-            choice = Choice(item, place, world, room, claims, None, suits(index), positions)
-            placed = _with_node(request, item, choice)
-            if isinstance(placed, Fault):
-                faults.append(placed)
-            else:
-                demanded[index] = placed
-                room.take(_claim(request, placed))
-    # Services come after all applications, because a service runs on its application's node if it
-    # can.
-    for index, item in enumerate(demanded):
-        if isinstance(item.held, Application) and item.held.node:
-            if faults and trial is not None:
-                return request, faults
-            checkpoint()
-            demanded[index], failed = _with_services(request, item, world, room, suits(index))
-            faults += failed
-    return replace(request, demanded=tuple(demanded)), faults
+        return self._attempt(request, ())
 
 
-def may_wait(request: Demand, world: World, checkpoint: Callable[[], None]) -> bool:
+def may_wait(request: Demand, state: State, checkpoint: Callable[[], None]) -> bool:
     """Return whether a demand that lacks only room may wait.
 
     Each application and service needs a node that would fit, in a domain that lets demands wait.
@@ -174,55 +314,23 @@ def may_wait(request: Demand, world: World, checkpoint: Callable[[], None]) -> b
         app = item.held
         if not isinstance(app, Application):
             continue
-        # All nodes count as empty, so the choices show which nodes could ever fit.
-        empty, claims, choices = Room(world, Usage()), (_claim(request, item),), list[Choice]()
+        room, choices = Room(state, Usage()), list[Choice]()
         if app.place and not app.node:
-            choices.append(Choice(item, app.place, world, empty, claims))
-        for service in _services_to_place(app, world):
-            required = requirement_of(service)
-            choices.append(Choice(item, required, world, empty, claims, service))
+            choices.append(Choice(item, app.place, room))
+        for service in _services_to_place(app, state):
+            choices.append(Choice(item, requirement_of(service), room, service))
         for choice in choices:
             checkpoint()
-            for node in choice.nodes():
-                if world.config.domain_of[node].when_full == "wait":
-                    on_it = candidates.on_node(choice.app, node, choice.service, world)
-                    claim = _claim(request, replace(item, held=on_it))
-                    # A person approves only what can be booked at once, so what needs approval
-                    # cannot wait.
-                    if not permission.approval_reasons(request, [(None, claim)], world.config):
-                        break
-            else:
+            waiting = (
+                choice.on(Chosen(node, "")).held.booked()
+                for node in choice.nodes()
+                if state.config.domain_of[node].when_full == "wait"
+            )
+            claims = (Claim(held, "", request.id, item.requesters, _NEVER) for held in waiting)
+            # A person approves only what can be booked at once, so what needs approval cannot wait.
+            if all(permission.approval_reasons(request, [(None, c)], state.config) for c in claims):
                 return False
     return True
-
-
-def _claim(request: Demand, item: Item) -> Claim:
-    """Return the claim that a demanded application would get if it were booked last of all."""
-    demand = request.demand or demand_id(request.id, item.requesters)
-    return Claim(item.held.booked(), demand, request.id, item.requesters, _LAST)
-
-
-def _with_node(request: Demand, item: Item, choice: Choice) -> Item | Fault:
-    app = choice.app
-    if app.node:
-        # ``node`` and ``place`` together are a check of the named node, and no preference.
-        node = choice.config.nodes.get(app.node)
-        # admission reports an unknown node
-        lacking = list(lacks(node, choice.requirement)) if node else []
-        if not lacking:
-            return replace(item, held=replace(app, place=None))
-        message = (
-            f"{quoted(app.node)} lacks {joined(lacking)}; name another node, or leave out one of "
-            "the fields 'node' and 'place'"
-        )
-        return item.fault("place", message, code="no-node")
-    chosen = _booked(choice, request.demand)
-    if chosen is None:
-        chosen = next(choice.candidates(), None) or choice.none_fits()
-    if isinstance(chosen, Fault):
-        return chosen
-    placed = f"application '{app.id}' is placed on {quoted(chosen.node)}, {chosen.why}"
-    return replace(item, held=replace(app, node=chosen.node), placed=(placed,))
 
 
 def _shared_node(app: Application, service: Service, world: World) -> str:
@@ -239,9 +347,9 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
     return ""
 
 
-def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
-    """Return the booked node if it stays, a fault if it must but lacks something, or ``None``."""
-    app, claims = choice.app, choice.world.ledger.claims_on(choice.app.subject)
+def _booked(choice: Choice, demand: str) -> Chosen | None:
+    """Return the booked node if it stays; raise Refused if it must but lacks something."""
+    app, claims = choice.app, choice.room.world.ledger.claims_on(choice.app.subject)
     if not claims:
         return None
     id = claims[0].application.node
@@ -259,83 +367,9 @@ def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
         f"'{app.id}' is held by {', '.join(other.requesters)} on '{id}', which "
         f"lacks {joined(lacking)}; ask only for what '{id}' has, or use another application id"
     )
-    return choice.item.fault("place", message, code="conflict")
+    raise Refused([choice.item.fault("place", message, code="conflict")])
 
 
 def _of_another(claims: tuple[Claim, ...], demand: str) -> Claim | None:
     others = (claim for claim in claims if claim.demand != demand and not claim.keeping_override)
     return next(others, None)
-
-
-def _with_services(
-    request: Demand,
-    item: Item,
-    world: World,
-    room: Room,
-    suits: Callable[[Application], bool] | None,
-) -> tuple[Item, list[Fault]]:
-    app = item.held
-    assert isinstance(app, Application)  # noqa: S101 - callers pass only applications
-    claims, faults = world.ledger.claims_on(app.subject), list[Fault]()
-    first = claims[0].application if claims and claims[0].application.appdef == app.appdef else None
-    if first and (request.is_reference or _of_another(claims, request.demand)):
-        # What others hold stays where it is. So does what a goal of the reference's action holds:
-        # its connections are those that it lists, and would not follow.
-        for name in app.named:
-            node = first.chosen_node(name)
-            if node != app.services[name]:
-                message = (
-                    f"{quoted(app.services[name])} contradicts an existing claim of "
-                    f"{', '.join(claims[0].requesters)}: service {name} of '{app.id}' is on node "
-                    f"'{node}'; name node '{node}', or use another application id"
-                )
-                faults.append(item.fault(f"services.{name}", message, code="conflict"))
-        # A service that the claim does not place runs with its application. To name that node
-        # changes nothing, and is not recorded, because all claims on an application say the same.
-        named = tuple(name for name in app.named if name in first.services)
-        item = replace(item, held=replace(app, services=first.services, named=named))
-        room.book([_claim(request, item)])
-        return item, faults
-    services = world.config.services.get(app.appdef, {})
-    for name in app.named:
-        wanted, definition = world.config.nodes.get(app.services[name]), services.get(name)
-        if wanted and definition and (lacking := [*lacks(wanted, requirement_of(definition))]):
-            message = (
-                f"{quoted(wanted.id)} lacks {joined(lacking)}, which the service requires ('place' "
-                f"in {definition.file}); name another node, or name none for this service"
-            )
-            faults.append(item.fault(f"services.{name}", message, code="no-node"))
-    # A node that the demand named for a service and names no longer does not stay.
-    no_longer_named = {
-        name
-        for claim in claims
-        if claim.demand == request.demand
-        for name in claim.application.named
-    }
-    stay = {*services} - {*app.services} - no_longer_named
-    booked = first.services if first else {}
-    kept = {name: node for name, node in booked.items() if name in stay}
-    item = replace(item, held=replace(app, services=kept | {**app.services}))
-    positions = request.positions
-    for service in _services_to_place(app, world):
-        claims = (_claim(request, item),)
-        required = requirement_of(service)
-        choice = Choice(item, required, world, room, claims, service, suits, positions)
-        here, shared = booked.get(service.name, ""), _shared_node(choice.app, service, world)
-        chosen: Chosen | Fault = Chosen(here, "where it is booked already")
-        if not here or (here != shared and not choice.fits(here)):
-            chosen = (
-                choice.chosen(shared, "where the service already runs for this topic")
-                or next(choice.candidates(), None)
-                or choice.none_fits()
-            )
-        if isinstance(chosen, Fault):
-            faults.append(chosen)
-            continue
-        text = f"service '{service.name}' of application '{app.id}' is placed on "
-        placed = f"{text}{quoted(chosen.node)}, {chosen.why}"
-        held = candidates.on_node(choice.app, chosen.node, service, world)
-        item = replace(item, held=held, placed=(*item.placed, placed))
-        room.newly_placed[chosen.node] += 1
-        room.book([_claim(request, item)])
-    return item, faults

@@ -81,6 +81,13 @@ class Scaling(CamelModel):
             raise ValueError(f"'topicsPerReplica' has a new name; write 'per: {{topics: {per}}}'")
         return {name: value for name, value in data.items() if name != "downAfter"}  # ignored
 
+    @property
+    def least(self) -> int:
+        """The replicas that request resources at least, whatever is demanded."""
+        if self.autoscaler:
+            return self.max
+        return min(self.sizes.replicas.values()) if self.sizes else self.min
+
     @model_validator(mode="after")
     def _consistent(self) -> Scaling:
         if problems := [*self._problems()]:

@@ -43,7 +43,11 @@ from demandops.model.config.inventory import Position, read_condition
 
 @dataclass(frozen=True, slots=True)
 class InputTopic:
-    """An input topic of an application, and the node that publishes it."""
+    """An input topic of an application, and the node that publishes it.
+
+    A demand may instead name an ``output`` of an ``application``, as ``<service>.<output>`` or
+    without the service. The claim has them beside the topics that they meant (:mod:`.chains`).
+    """
 
     __pydantic_config__: ClassVar = PART
 
@@ -53,13 +57,15 @@ class InputTopic:
     # It was not the usual topic of its source when it was booked. The claim says so, because a name
     # that is made from it must not change while it is demanded (:mod:`.flows`).
     further: Annotated[StrictBool, RECORDED, SkipJsonSchema()] = False
+    application: str = ""
+    output: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "topic", absolute_topic(self.topic))
 
     @property
-    def order(self) -> tuple[str, str, str, bool]:
-        return self.topic, self.source, self.type, self.further
+    def order(self) -> tuple[str, str, str, bool, str, str]:
+        return self.topic, self.source, self.type, self.further, self.application, self.output
 
     def part_in(self, version: str) -> str:
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
@@ -200,6 +206,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     moved: Annotated[Mapping[str, str], RECORDED, SkipJsonSchema()] = field(default_factory=dict)
     # the services whose node the demand itself names; the generator chose the nodes of the others
     named: Annotated[Items[str], RECORDED, SkipJsonSchema()] = ()
+    # The demand does not list it, but holds it for these applications: the outputs that each reads.
+    held_for: Annotated[Mapping[str, Items[str]], RECORDED, SkipJsonSchema()] = field(
+        default_factory=dict
+    )
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Application):
@@ -227,6 +237,14 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     def all_inputs(self) -> list[tuple[str, InputTopic]]:
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
+
+    @property
+    def read_outputs(self) -> dict[str, tuple[str, ...]]:  # of other applications
+        read: dict[str, set[str]] = {}
+        for _, topic in self.all_inputs():
+            if topic.application:
+                read.setdefault(topic.application, set()).add(topic.output)
+        return {id: tuple(sorted(outputs)) for id, outputs in sorted(read.items())}
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
         # the inputs must be sorted, as in a claim
@@ -344,6 +362,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ("moved",)
         for role, topic in self.all_inputs():
             yield ("takes", topic.source, topic.topic)
+            if topic.application:
+                yield ("reads", topic.application)
             yield ("from", topic.source)
             yield ("node", topic.source)
             if topic.further or self.separate:
@@ -540,7 +560,10 @@ class Demand:
         """Return what keeps demands that share it in their order; None touches everything."""
         if self.operation in ("decommission", "rollback"):
             return None
-        return frozenset((*self.subjects(), *([("demand", self.demand)] if self.demand else ())))
+        apps = (item.held for item in self.demanded if isinstance(item.held, Application))
+        read = (Subject(SubjectKind.APPLICATION, id) for app in apps for id in app.read_outputs)
+        own = [("demand", self.demand)] if self.demand else []
+        return frozenset((*self.subjects(), *read, *own))
 
 
 AnyDemand = TypeVar("AnyDemand", bound=Demand)

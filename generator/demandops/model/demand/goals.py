@@ -97,6 +97,17 @@ class DemandGoal(FrozenModel):
             ):
                 if given:
                     yield fault(name, message)
+        for index, app in enumerate(self.applications):
+            for role, topics in app.inputs.items():
+                for place, topic in enumerate(topics):
+                    where = f"applications[{index}].inputs.{role}[{place}]"
+                    if (topic.application or topic.output) and (topic.topic or topic.source):
+                        message = "names both a topic and an output of an application; name one"
+                        yield fault(where, message)
+                    elif bool(topic.application) != bool(topic.output):
+                        missing = "output" if topic.application else "application"
+                        message = "is missing: an output is named by 'application' and 'output'"
+                        yield fault(f"{where}.{missing}", f"{message}; add it")
         placed = set[str]()
         for index, position in enumerate(self.positions):
             if position.node in placed:

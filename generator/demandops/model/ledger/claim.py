@@ -170,7 +170,7 @@ class _ClaimFile(FrozenModel):
 def text_of(claim: Claim) -> str:
     data = plain(claim.held)
     if claim.is_on_application:
-        for name in ("inputs", "parameters", "services", "moved"):
+        for name in ("inputs", "parameters", "services", "moved", "held_for"):
             if name in data:
                 data[name] = dict(sorted(data[name].items()))
     else:

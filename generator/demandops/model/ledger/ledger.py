@@ -98,6 +98,9 @@ class Ledger:
             if claim is not None:
                 yield claim
 
+    def claims_reading_outputs(self, application: str) -> tuple[Claim, ...]:
+        return self._claims("reads", application)
+
     def claims_from(self, node: str) -> Iterator[Claim]:
         # that read a topic of the node or carry one from it, in no order
         keys = self.index.get(("from", node)) or ()

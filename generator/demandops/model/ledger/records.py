@@ -69,6 +69,7 @@ class Wait(Demand):
     """What a demand that must wait becomes; ``reasons`` say why."""
 
     operation: Operation = "wait"
+    is_complete: bool = True
     waiting: WaitingDemand | None = None
     reasons: tuple[str, ...] = ()
 

@@ -1,4 +1,4 @@
-"""New Git objects, in memory and as a pack."""
+"""New Git objects, which are made in memory and written as one pack."""
 
 from __future__ import annotations
 
@@ -13,15 +13,18 @@ import subprocess
 import weakref
 import zlib
 from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import NamedTuple
 
 import pygit2
-from pygit2 import Oid, Repository, Tree
+from pygit2 import Oid, Repository, Signature, Tree
 from pygit2.enums import ObjectType
+
+from demandops.repo.git.signing import Signer
+from demandops.repo.git.tree import printable
 
 # ---- a pack and its index in Git's format ----
 #
@@ -54,14 +57,20 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
         packed.append(Packed(oid.raw, zlib.crc32(part), offset))
         parts.append(part)
         offset += len(part)
-    checksum = _sha1_of_parts(parts)
+    pack = b"".join(parts)
+    checksum = hashlib.sha1(pack).digest()  # noqa: S324 - Git's checksum
     path = folder / f"pack-{checksum.hex()}.pack"
-    _write_synced(path, [*parts, checksum])
-    _write_synced(path.with_suffix(".idx"), index_of(packed, checksum))
+    index = path.with_suffix(".idx")
+    for file, content in ((path, (pack, checksum)), (index, (index_of(packed, checksum),))):
+        handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o444)  # as git's packs
+        with open(handle, "wb") as opened:  # noqa: PTH123 - opens a file descriptor
+            opened.writelines(content)
+            opened.flush()
+            os.fsync(handle)
     return path
 
 
-def index_of(packed: Iterable[Packed], checksum: bytes) -> list[bytes]:
+def index_of(packed: Iterable[Packed], checksum: bytes) -> bytes:
     # version 2 of the format
     packed = sorted(packed)
     firsts = [item.oid[0] for item in packed]
@@ -77,23 +86,8 @@ def index_of(packed: Iterable[Packed], checksum: bytes) -> list[bytes]:
         struct.pack(f">{len(far)}Q", *far),
         checksum,
     ]
-    return [*parts, _sha1_of_parts(parts)]
-
-
-def _sha1_of_parts(parts: Iterable[bytes]) -> bytes:
-    digest = hashlib.sha1()  # noqa: S324 - Git's checksums
-    for part in parts:
-        digest.update(part)
-    return digest.digest()
-
-
-def _write_synced(path: Path, parts: Iterable[bytes]) -> None:
-    # read-only, like git's packs
-    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o444)
-    with open(handle, "wb") as file:  # noqa: PTH123 - opens a file descriptor
-        file.writelines(parts)
-        file.flush()
-        os.fsync(handle)
+    index = b"".join(parts)
+    return index + hashlib.sha1(index).digest()  # noqa: S324 - Git's checksum
 
 
 # ---- new objects: kept in memory, then written to the disk as one pack ----
@@ -128,17 +122,12 @@ class NewObjects(pygit2.OdbBackend):
         super().__init__()
         # a strong reference would leak the repository and this object: Python does not know that
         # libgit2 refers to this object, so it could not free the cycle
-        self._repo = weakref.ref(repo)
+        self._repo: Repository = weakref.proxy(repo)
+        self._packs = Path(repo.path) / "objects" / "pack"
         self._unpacked: dict[Oid, tuple[ObjectType, bytes]] = {}
         self._folders: dict[Oid, Entries] = {}
         # the lowest priority, because most objects are read from the disk
         repo.odb.add_backend(self, 0)
-
-    @property
-    def repo(self) -> Repository:
-        repo = self._repo()
-        assert repo is not None  # noqa: S101 - its writer has a strong reference
-        return repo
 
     def add(self, kind: ObjectType, data: bytes) -> Oid:
         content = b"%s %d\0%s" % (_TYPES[kind], len(data), data)
@@ -146,17 +135,77 @@ class NewObjects(pygit2.OdbBackend):
         self._unpacked[oid] = (kind, data)
         return oid
 
-    def folder(self, oid: Oid) -> Entries:
-        remembered = self._folders.pop(oid, None)
-        if remembered is not None:
-            return remembered
-        return {
-            name + b"/" if mode == _FOLDER else name: entry
-            for entry, mode, name in _ENTRY.findall(self.repo[oid].peel(Tree).read_raw())
-        }
+    def add_commit(
+        self,
+        signer: Signer | None,
+        people: tuple[Signature, Signature],  # author and committer
+        text: str,
+        tree: Oid,
+        parents: Sequence[Oid],
+    ) -> Oid:
+        content = str(self._repo.create_commit_string(*people, text, tree, list(parents)))
+        if signer is not None:
+            head, end, message = content.partition("\n\n")
+            # in a commit's header, a line that begins with a space continues the line before
+            signature = signer.sign(content.encode()).replace("\n", "\n ")
+            content = f"{head}\ngpgsig {signature}{end}{message}"
+        return self.add(ObjectType.COMMIT, content.encode())
 
-    def add_folder(self, entries: Entries) -> Oid:
-        # ``entries`` are kept, so the caller must not change them afterwards
+    def add_tree(self, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
+        """Add the tree ``base`` with the changes in ``files``, where None removes a file or folder.
+
+        Only the folders above a changed file are written again.
+        """
+        tree = self._add_folder(base.id if base is not None else None, files)
+        return tree or self.add(ObjectType.TREE, b"")
+
+    def _add_folder(  # noqa: PLR0912
+        self, base: Oid | None, files: Mapping[str, str | None]
+    ) -> Oid | None:
+        # None if the folder becomes empty, because Git has no empty folders
+        if base is None:
+            entries = Entries()
+        elif base in self._folders:
+            entries = self._folders.pop(base)
+        else:
+            raw = self._repo[base].peel(Tree).read_raw()
+            entries = {
+                name + b"/" if mode == _FOLDER else name: entry
+                for entry, mode, name in _ENTRY.findall(raw)
+            }
+        below: dict[bytes, dict[str, str | None]] = {}
+        here: dict[bytes, str | None] = {}
+        for path, text in files.items():
+            folder_name, _, inner_path = path.partition("/")
+            raw_name = folder_name.encode()
+            if raw_name not in entries and b"\\" in raw_name:
+                # a backslash may stand for a byte that is not UTF-8
+                names = (key.removesuffix(b"/") for key in entries)
+                raw_name = next((n for n in names if printable(n) == folder_name), raw_name)
+            if inner_path:
+                below.setdefault(raw_name, {})[inner_path] = text
+            else:
+                here[raw_name] = text
+        for name, inner in below.items():
+            folder = name + b"/"
+            kept = folder in entries and here.get(name, "") is not None
+            old = Oid(raw=entries[folder][-20:]) if kept else None  # an entry ends with the raw id
+            subtree = self._add_folder(old, inner)
+            if subtree is not None:
+                entries.pop(name, None)
+                entries[folder] = b"40000 %s\0%s" % (name, subtree.raw)
+            elif kept:
+                del entries[folder]
+        for name, text in here.items():  # after the folders, so that a file can replace a folder
+            if text is not None:
+                entries.pop(name + b"/", None)
+                blob = self.add(ObjectType.BLOB, text.encode())
+                entries[name] = b"100644 %s\0%s" % (name, blob.raw)
+            elif not any(inner is not None for inner in below.get(name, {}).values()):
+                entries.pop(name, None)
+                entries.pop(name + b"/", None)
+        if not entries:
+            return None
         oid = self.add(ObjectType.TREE, b"".join(map(entries.__getitem__, sorted(entries))))
         self._folders[oid] = entries
         if len(self._folders) > _REMEMBERED:
@@ -182,7 +231,7 @@ class NewObjects(pygit2.OdbBackend):
             needed[oid] = None
             kind, data = self._unpacked[oid]
             if kind is ObjectType.COMMIT:
-                parsed = self.repo[oid].peel(pygit2.Commit)
+                parsed = self._repo[oid].peel(pygit2.Commit)
                 queue += [parsed.tree_id, *parsed.parent_ids]
             elif kind is ObjectType.TREE:
                 queue += [unpacked[raw] for raw in _ID.findall(data) if raw in unpacked]
@@ -202,14 +251,14 @@ class NewObjects(pygit2.OdbBackend):
         If ``since`` is unknown here, the pack has all objects of ``commit``. The repository has
         them already, but an earlier sync of them may have failed.
         """
-        without = f"^{since}\n" if since and since in self.repo else ""
+        without = f"^{since}\n" if since and since in self._repo else ""
 
         def copy(folder: Path) -> Path:
             done = subprocess.run(
                 # packing each object anew reads and checks it
                 ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
                  "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
-                cwd=self.repo.path,
+                cwd=self._repo.path,
                 input=f"{commit}\n{without}",
                 capture_output=True,
                 text=True,
@@ -226,32 +275,42 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def _placed(self, build: Callable[[Path], Path]) -> Iterator[None]:
-        packs = self._packs
-        with _locked(packs, fcntl.LOCK_SH), _new_folder(self.repo.path) as folder:
-            built = build(folder)
-            placed = packs / built.name
-            keep = placed.with_suffix(".keep")
-            keep.unlink(missing_ok=True)
+        with _locked(self._packs, fcntl.LOCK_SH):
+            folder = Path(mkdtemp(dir=self._packs.parents[1], prefix=UNFINISHED))
+            keep: Path | None = None
             try:
-                # git removes no pack that has a .keep file
-                _link_or_write(keep, built.with_suffix(".idx"))
+                pack = build(folder)
+                index, keep = pack.with_suffix(".idx"), self._packs / f"{pack.stem}.keep"
+                keep.unlink(missing_ok=True)
+                try:  # git removes no pack that has a .keep file
+                    keep.hardlink_to(index)  # which is synced already, so this costs no sync
+                except OSError as error:
+                    if error.errno not in _NO_LINKS:
+                        raise
+                    unplaced = index.with_suffix(".keep")
+                    with unplaced.open("wb") as file:
+                        file.write(_INDEX)
+                        file.flush()
+                        os.fsync(file.fileno())
+                    unplaced.replace(keep)
                 # the pack comes first, because git removes an index without a pack
-                built.replace(placed)
-                built.with_suffix(".idx").replace(placed.with_suffix(".idx"))
-                sync_folder(packs)
+                pack.replace(self._packs / pack.name)
+                index.replace(self._packs / index.name)
+                sync_folder(self._packs)
                 yield
             finally:
-                with suppress(OSError):  # the next start removes the .keep file
-                    keep.unlink(missing_ok=True)
-
-    @property
-    def _packs(self) -> Path:
-        return Path(self.repo.path) / "objects" / "pack"
+                # What stays is removed at the next start. For the folder itself, rmtree raises some
+                # errors nevertheless.
+                with suppress(OSError):
+                    if keep is not None:
+                        keep.unlink(missing_ok=True)
+                with suppress(OSError):
+                    shutil.rmtree(folder, ignore_errors=True)
 
     def clean(self) -> None:
         # of what killed processes left, unless another process writes a pack now
         with suppress(OSError), _locked(self._packs, fcntl.LOCK_EX | fcntl.LOCK_NB):
-            for folder in Path(self.repo.path).glob(f"{UNFINISHED}*"):
+            for folder in Path(self._repo.path).glob(f"{UNFINISHED}*"):
                 shutil.rmtree(folder, ignore_errors=True)
             for keep in self._packs.glob("*.keep"):
                 with keep.open("rb") as file:  # a person's .keep does not begin like an index
@@ -283,18 +342,6 @@ class NewObjects(pygit2.OdbBackend):
 
 
 @contextmanager
-def _new_folder(parent: str) -> Iterator[Path]:
-    folder = mkdtemp(dir=parent, prefix=UNFINISHED)
-    try:
-        yield Path(folder)
-    finally:
-        # For the folder itself, rmtree raises some errors nevertheless. A folder that stays is
-        # removed at the next start.
-        with suppress(OSError):
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
 def _locked(folder: Path, operation: int) -> Iterator[None]:
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -302,20 +349,6 @@ def _locked(folder: Path, operation: int) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
-
-
-def _link_or_write(keep: Path, index: Path) -> None:
-    try:
-        keep.hardlink_to(index)  # which is synced already, so this costs no sync
-    except OSError as error:
-        if error.errno not in _NO_LINKS:
-            raise
-        unplaced = index.with_suffix(".keep")
-        with unplaced.open("wb") as file:
-            file.write(_INDEX)
-            file.flush()
-            os.fsync(file.fileno())
-        unplaced.replace(keep)
 
 
 def sync_folder(folder: Path) -> None:

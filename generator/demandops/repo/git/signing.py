@@ -6,18 +6,16 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 import git
-from pygit2 import Commit, Oid, Repository, Signature
-from pygit2.enums import ObjectType
+from pygit2 import Commit, Oid, Repository
 
 from demandops.base.errors import StateRepoError
 from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
-from demandops.repo.git.objects import NewObjects
 
 # ---- signing with an SSH key, in the same way as git ----
 #
@@ -86,23 +84,6 @@ class Signer:
         else:
             why = f"cannot sign: {last.strip()}; name a private SSH key"
         raise SigningFailed(f"signing key {self.key} {why}")
-
-
-def create_commit(
-    objects: NewObjects,
-    signer: Signer | None,
-    people: tuple[Signature, Signature],  # author and committer
-    text: str,
-    tree: Oid,
-    parents: Sequence[Oid],
-) -> Oid:
-    content = str(objects.repo.create_commit_string(*people, text, tree, list(parents)))
-    if signer is not None:
-        head, end, message = content.partition("\n\n")
-        # in a commit's header, a line that begins with a space continues the line before
-        signature = signer.sign(content.encode()).replace("\n", "\n ")
-        content = f"{head}\ngpgsig {signature}{end}{message}"
-    return objects.add(ObjectType.COMMIT, content.encode())
 
 
 # ---- checking against the keys that people allow ----

@@ -1,18 +1,17 @@
-"""Git trees: looking up a path, reading files, comparing trees, writing only the changed parts."""
+"""Git trees: looking up a path, reading files, comparing trees."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from itertools import islice
 
 import pygit2
 from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
-from pygit2.enums import FileMode, ObjectType, SortMode
+from pygit2.enums import FileMode, SortMode
 
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import quoted
-from demandops.repo.git.objects import NewObjects
 
 # Sync the files that libgit2 writes, so that a commit is on the disk before anybody learns of it.
 pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
@@ -48,7 +47,7 @@ def place_of(repo: Repository, wanted: Oid) -> str | None:
     def path_in(tree: Tree, prefix: str) -> str | None:
         seen.add(tree.id)
         for child in tree:
-            path = prefix + _printable(child.raw_name or b"")
+            path = prefix + printable(child.raw_name or b"")
             if child.id == wanted:
                 return path
             if isinstance(child, Tree) and child.id not in seen and path.count("/") < MAX_DEPTH:
@@ -112,14 +111,14 @@ def entries(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Object]]:
 
 def _entries_below(tree: Tree, prefix: str, depth: int) -> Iterator[tuple[str, Object]]:
     for child in tree:
-        path = prefix + _printable(child.raw_name or b"")
+        path = prefix + printable(child.raw_name or b"")
         if isinstance(child, Tree) and depth < MAX_DEPTH:
             yield from _entries_below(child, f"{path}/", depth + 1)
         else:
             yield path, child
 
 
-def _printable(name: bytes) -> str:
+def printable(name: bytes) -> str:
     return name.decode("utf-8", "backslashreplace")
 
 
@@ -159,8 +158,8 @@ def differences(
 def _differences_below(
     before: Tree | None, after: Tree | None, prefix: str
 ) -> Iterator[tuple[str, Oid | None]]:
-    old = {_printable(child.raw_name or b""): child for child in before or ()}
-    new = {_printable(child.raw_name or b""): child for child in after or ()}
+    old = {printable(child.raw_name or b""): child for child in before or ()}
+    new = {printable(child.raw_name or b""): child for child in after or ()}
     for name in sorted({*old, *new}):
         yield from _differences_at(old.get(name), new.get(name), f"{prefix}{name}")
 
@@ -181,48 +180,3 @@ def _differences_at(
 
 def is_readme(path: str) -> bool:
     return path.rsplit("/", 1)[-1] == "README.md"
-
-
-def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
-    """Write the tree ``base`` with the changes in ``files``, where None removes a file or folder.
-
-    Only the folders above a changed file are written again.
-    """
-    return _write(objects, base.id if base is not None else None, files) or objects.add_folder({})
-
-
-def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None]) -> Oid | None:
-    # None if the folder becomes empty, because Git has no empty folders
-    entries = objects.folder(base) if base is not None else {}
-    below: dict[bytes, dict[str, str | None]] = {}
-    here: dict[bytes, str | None] = {}
-    for path, text in files.items():
-        folder_name, _, inner_path = path.partition("/")
-        raw_name = folder_name.encode()
-        if raw_name not in entries and b"\\" in raw_name:
-            # a backslash may stand for a byte that is not UTF-8
-            names = (key.removesuffix(b"/") for key in entries)
-            raw_name = next((name for name in names if _printable(name) == folder_name), raw_name)
-        if inner_path:
-            below.setdefault(raw_name, {})[inner_path] = text
-        else:
-            here[raw_name] = text
-    for name, inner in below.items():
-        folder = name + b"/"
-        kept = folder in entries and here.get(name, "") is not None
-        old = Oid(raw=entries[folder][-20:]) if kept else None  # an entry ends with the raw id
-        subtree = _write(objects, old, inner)
-        if subtree is not None:
-            entries.pop(name, None)
-            entries[folder] = b"40000 %s\0%s" % (name, subtree.raw)
-        elif kept:
-            del entries[folder]
-    for name, text in here.items():  # after the folders, so that a file can replace a folder
-        if text is not None:
-            entries.pop(name + b"/", None)
-            blob = objects.add(ObjectType.BLOB, text.encode())
-            entries[name] = b"100644 %s\0%s" % (name, blob.raw)
-        elif not any(inner is not None for inner in below.get(name, {}).values()):
-            entries.pop(name, None)
-            entries.pop(name + b"/", None)
-    return objects.add_folder(entries) if entries else None

@@ -1,12 +1,15 @@
-"""The history, and the form of the messages that it consists of."""
+"""The history: its commits, and who made or caused them."""
 
 from __future__ import annotations
 
+import getpass
+import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-from typing import Literal, get_args
+from functools import cache
+from typing import Literal, NamedTuple, get_args
 
 import git
 import pygit2
@@ -14,88 +17,26 @@ from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
 from demandops.base.errors import StateRepoError
-from demandops.base.quoting import escaped, harmless, is_visible, one_line
+from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT
+from demandops.model.config.config import CONFIG_ROOTS
+from demandops.model.ledger.claim import LEDGER_ROOT
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.tree import commit_of
-
-# ---- the text of messages: paragraphs of lines, and trailers in the last paragraph ----
-#
-# Only this module writes and reads messages. A line of a paragraph is for people: its text is
-# escaped and shortened. A trailer is for programs: its value is read back exactly. A value of
-# visible characters on which no forge acts is written unchanged, so ``git log
-# --format='%(trailers:key=Requester)'`` shows it; any other value is written in double quotes with
-# escapes like ``\u202e``. So no value can begin a line, end the message, look like a trailer or
-# give a forge an order. Messages of earlier versions, which did not quote, are read the same way.
-
-Trailers = Iterable[tuple[str, str]]
-
-_WHY = "Why: "
-_AS_WRITTEN = ("Reason",)  # the person who runs a command may close an issue with it
-_KEY = re.compile(r"[A-Za-z0-9-]+")
-_ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U00(?:0[0-9a-f]|10)[0-9a-f]{4}|[nrt\\\"])"
-_ESCAPES = re.compile(_ESCAPE)
-_EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
-# A quoted value has an escape, because values without escapes are not quoted.
-_QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
-
-
-@dataclass(frozen=True, slots=True)
-class MessageText:
-    summary: str
-    why: str
-    trailers: dict[str, list[str]]
-
-
-def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
-    # without empty paragraphs and trailers
-    lines = [f"{key}: {_encoded(key, value)}" for key, value in trailers if value]
-    body = ("\n".join(harmless(one_line(line)) for line in lines) for lines in paragraphs)
-    return "\n\n".join(text for text in (*body, "\n".join(lines)) if text) + "\n"
-
-
-def parse(message: str) -> MessageText:
-    lines = message.split("\n")
-    whys = (line.removeprefix(_WHY) for line in lines if line.startswith(_WHY))
-    trailers: dict[str, list[str]] = {}
-    head, _, last = message.rstrip("\n").rpartition("\n\n")
-    for line in last.split("\n") if head else ():
-        key, colon, value = line.partition(": ")
-        if not colon or not _KEY.fullmatch(key):
-            trailers.clear()  # a paragraph with any other line is text for people
-            break
-        if _QUOTED.fullmatch(value):
-            value = _ESCAPES.sub(
-                lambda m: m[0][1] if m[0][1] in '\\"' else m[0].encode().decode("unicode_escape"),
-                value[1:-1],
-            )
-        trailers.setdefault(key, []).append(value)
-    return MessageText(lines[0], next(whys, ""), trailers)
-
-
-def _encoded(key: str, value: str) -> str:
-    is_plain = is_visible(value) and value == value.strip() and not _QUOTED.fullmatch(value)
-    if is_plain and (key in _AS_WRITTEN or harmless(value) == value):
-        return value
-    text = escaped(value.replace("\\", r"\\").replace('"', r"\""))
-    return f'"{_EDGES.sub(_SPACE, harmless(text))}"'
-
+from demandops.repo.history.commit_message import (
+    GENERATOR_EMAIL,
+    GENERATOR_NAME,
+    PROPOSAL,
+    generator_signature,
+    parse,
+    signature,
+)
 
 # ---- the history: commits with their trailers, and which commits changed a path ----
 #
 # Everything comes from commit messages, trailers and ``git log -- <path>``, so plain git shows the
 # same.
-
-# The trailer that names the branch on which a commit was proposed for approval.
-PROPOSAL = "Proposal"
-# The trailer with the branch and commit where the demand was proposed with other content.
-REPLACES = "Replaces"
-REQUIRED_BY = "Approval-Required-By"  # the trailer, repeated, with what requires the approval
-
-# The committer of every commit by a generator.
-GENERATOR_NAME = "DemandOps generator"
-GENERATOR_EMAIL = "generator@demandops.invalid"
 
 # Of the year 9999: datetime has no later year, but anybody may commit with one.
 _LAST_SECOND = 253402300799
@@ -130,7 +71,7 @@ def _time(seconds: int) -> datetime:
     return datetime.fromtimestamp(min(max(seconds, 0), _LAST_SECOND), tz=timezone.utc)
 
 
-def author_of(commit: Commit) -> tuple[str, str]:
+def _raw_author(commit: Commit) -> tuple[str, str]:
     return _text(commit.author.raw_name), _text(commit.author.raw_email)
 
 
@@ -148,7 +89,7 @@ def entry_of(commit: Commit) -> LogEntry:
     return LogEntry(
         commit=str(commit.id),
         time=time_of(commit),
-        author=author_of(commit)[0],
+        author=_raw_author(commit)[0],
         summary=text.summary,
         trailers=text.trailers if is_told else {},
         why=text.why if is_told else "",
@@ -336,3 +277,90 @@ def _git_log(repo: Repository, tip: str | Oid, after: str | None, *query: str) -
         except git.GitCommandError as error:
             raise StateRepoError(f"git cannot read the history of {path}: {error.stderr}") from None
     return [item for item in output.split("\0") if item]
+
+
+# ---- authors: who made a commit or caused a follow commit, and who runs this program ----
+#
+# A follow commit is made by the generator, and renders what people committed. Its trailers name
+# people's commits, and its author names these people. A commit is by a person if no generator on
+# any machine made it, or if it is of a proposal.
+
+_ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
+_MOST_NAMED = 20
+_NO_ADDRESS = "@demandops.invalid"
+
+
+class Person(NamedTuple):
+    name: str
+    email: str
+
+    @property
+    def is_known(self) -> bool:
+        # if git knows no address, it is ``<login>@demandops.invalid``
+        return not self.email.endswith(_NO_ADDRESS)
+
+    def __str__(self) -> str:
+        return f"{self.name} <{self.email}>"
+
+
+def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
+    commits = person_commits(repo, to, known)
+    return [commit for commit in commits if _touches(commit, _ROOTS)]
+
+
+def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
+    # A fault is caused by the last person's commit that changed its file, else by the last one that
+    # changed any file of the generator. The function returns the commit's id and author.
+
+    @cache  # the commits are read only when needed: most problems are already in the report
+    def commits() -> list[Commit]:
+        return list(person_commits(repo, to, known))
+
+    def origin(path: str) -> tuple[str, str] | None:
+        for paths in ((path,) if path else (), _ROOTS):
+            for commit in commits():
+                if _touches(commit, paths):
+                    return str(commit.id), str(author_of(commit))
+        return None
+
+    return origin
+
+
+def _touches(commit: Commit, paths: Iterable[str]) -> bool:
+    return trees.differ(trees.parent_tree(commit), commit.tree, paths)
+
+
+def author_of(commit: Commit) -> Person:
+    plain = signature(*_raw_author(commit), time_of(commit))
+    return Person(plain.name, plain.email)
+
+
+def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
+    # of the newest causes, whose newest is first, in time's order
+    named = reversed(causes[:_MOST_NAMED])
+    return [("Caused-By", f"{commit.id} {author_of(commit)}") for commit in named]
+
+
+def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
+    if not causes:
+        return generator_signature(now)
+    people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))
+    names = ", ".join(dict.fromkeys(person.name for person in people))
+    # one person's own address, so that `git log --author` finds the follow commit too
+    email = people[0].email if len(people) == 1 else GENERATOR_EMAIL
+    return signature(names, email, time_of(causes[0]))
+
+
+def operator(folder: str | None = None) -> Person:
+    try:
+        login = getpass.getuser()
+    except (KeyError, OSError):  # a container's user has no passwd entry
+        login = "unknown"
+
+    def configured(variable: str, key: str) -> str:
+        setting = git.Git(folder).config("--get", key, with_exceptions=False)
+        return os.environ.get(variable) or str(setting)
+
+    name = configured("GIT_AUTHOR_NAME", "user.name") or login
+    email = configured("GIT_AUTHOR_EMAIL", "user.email") or f"{login}{_NO_ADDRESS}"
+    return Person(name, email)

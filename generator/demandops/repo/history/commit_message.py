@@ -1,43 +1,105 @@
-"""What a commit says, and who made it."""
+"""What a commit says: the form of its message, and what the generator writes there."""
 
 from __future__ import annotations
 
-import getpass
-import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from datetime import datetime
-from functools import cache
-from typing import NamedTuple
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime, timezone
 
-import git
 import pygit2
-from pygit2 import Commit, Oid, Repository
 
 from demandops.base.errors import Fault
 from demandops.base.naming import SubjectKind
-from demandops.base.quoting import one_line
-from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
+from demandops.base.quoting import escaped, harmless, is_visible, one_line
+from demandops.base.settings import RENDER_VERSION
 from demandops.decide.booking import Drain
 from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision
 from demandops.decide.rollback import Restoration
-from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.model.demand.demand import Decommission
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import LEDGER_ROOT, OVERRIDE_PREFIX, ClaimKey
+from demandops.model.ledger.claim import OVERRIDE_PREFIX, ClaimKey
 from demandops.model.ledger.records import Wait
-from demandops.repo.git import tree as trees
-from demandops.repo.history import commit_log, revisions
-from demandops.repo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME, REPLACES, compose
+
+# ---- the text of messages: paragraphs of lines, and trailers in the last paragraph ----
+#
+# Only this module writes and reads messages. A line of a paragraph is for people: its text is
+# escaped and shortened. A trailer is for programs: its value is read back exactly. A value of
+# visible characters on which no forge acts is written unchanged, so ``git log
+# --format='%(trailers:key=Requester)'`` shows it; any other value is written in double quotes with
+# escapes like ``\u202e``. So no value can begin a line, end the message, look like a trailer or
+# give a forge an order. Messages of earlier versions, which did not quote, are read the same way.
+
+Trailers = Iterable[tuple[str, str]]
+
+_WHY = "Why: "
+_AS_WRITTEN = ("Reason",)  # the person who runs a command may close an issue with it
+_KEY = re.compile(r"[A-Za-z0-9-]+")
+_ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U00(?:0[0-9a-f]|10)[0-9a-f]{4}|[nrt\\\"])"
+_ESCAPES = re.compile(_ESCAPE)
+_EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
+# A quoted value has an escape, because values without escapes are not quoted.
+_QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
+
+
+@dataclass(frozen=True, slots=True)
+class MessageText:
+    summary: str
+    why: str
+    trailers: dict[str, list[str]]
+
+
+def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
+    # without empty paragraphs and trailers
+    last = []
+    for key, value in ((key, value) for key, value in trailers if value):
+        is_plain = is_visible(value) and value == value.strip() and not _QUOTED.fullmatch(value)
+        if is_plain and (key in _AS_WRITTEN or harmless(value) == value):
+            last.append(f"{key}: {value}")
+        else:
+            text = harmless(escaped(value.replace("\\", r"\\").replace('"', r"\"")))
+            last.append(f'{key}: "{_EDGES.sub(_SPACE, text)}"')
+    body = ("\n".join(harmless(one_line(line)) for line in lines) for lines in paragraphs)
+    return "\n\n".join(text for text in (*body, "\n".join(last)) if text) + "\n"
+
+
+def parse(message: str) -> MessageText:
+    lines = message.split("\n")
+    whys = (line.removeprefix(_WHY) for line in lines if line.startswith(_WHY))
+    trailers: dict[str, list[str]] = {}
+    head, _, last = message.rstrip("\n").rpartition("\n\n")
+    for line in last.split("\n") if head else ():
+        key, colon, value = line.partition(": ")
+        if not colon or not _KEY.fullmatch(key):
+            trailers.clear()  # a paragraph with any other line is text for people
+            break
+        if _QUOTED.fullmatch(value):
+            value = _ESCAPES.sub(
+                lambda m: m[0][1] if m[0][1] in '\\"' else m[0].encode().decode("unicode_escape"),
+                value[1:-1],
+            )
+        trailers.setdefault(key, []).append(value)
+    return MessageText(lines[0], next(whys, ""), trailers)
+
+
+# The trailer that names the branch on which a commit was proposed for approval.
+PROPOSAL = "Proposal"
+# The trailer with the branch and commit where the demand was proposed with other content.
+REPLACES = "Replaces"
+REQUIRED_BY = "Approval-Required-By"  # the trailer, repeated, with what requires the approval
+
+# The committer of every commit by a generator.
+GENERATOR_NAME = "DemandOps generator"
+GENERATOR_EMAIL = "generator@demandops.invalid"
 
 # ---- messages: what changed in the desired state and why, for people and programs ----
 #
 # The trailers are a contract: an auditor without this program finds everything with ``git log
 # --format='%(trailers:key=Requester)'``. Values from outside appear in a message only as
-# :mod:`.commit_log` quotes them. :mod:`.state_in_effect` adds the trailers about quarantined files.
+# :func:`compose` quotes them. :mod:`.snapshot` adds the trailers about quarantined files.
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
@@ -83,15 +145,18 @@ def of_decision(
     request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
     more = list(more)
-    title, why = _title_and_why(decision, received)
+    requesters = _requesters(decision)
+    title, why, of_operation = _told(decision, requesters, received)
     replaced = "".join(value for key, value in more if key == REPLACES)
+    not_held = [f"  {item}" for item in decision.changes.not_held]
+    warnings = [f"  {warning}" for warning in decision.warnings]
     paragraphs = [
         [one_line(title, _MAX_SUBJECT)],
         [f"Changed: replaces {replaced}; no approval of that counts here."] if replaced else [],
         [f"Why: {why}"],
         _desired_state(decision.releases) if decision.releases or claims else [_UNCHANGED],
-        _list("Listed in the request, but not held by the requester:", decision.changes.not_held),
-        _list("Warnings:", decision.warnings),
+        ["Listed in the request, but not held by the requester:", *not_held] if not_held else [],
+        ["Warnings:", *warnings] if warnings else [],
     ]
     keys = [change.key for change in claims]
     demands = dict.fromkeys((*(key.demand for key in keys), *decision.changes.waiting))
@@ -99,21 +164,20 @@ def of_decision(
         ("Operation", request.operation),
         ("Operation-Id", operation),
         *more,
-        *_operation_trailers(decision),
+        *of_operation,
         *(("Demand-Id", demand) for demand in demands),
-        *(("Requester", requester) for requester in _requesters(decision)),
+        *(("Requester", requester) for requester in requesters),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
         *(("Connection", s.id) for s in subjects if s.kind is SubjectKind.CONNECTION),
         ("Request-Id", request.id),
-        *override_trailers([*decision.overrides, *keep_override_paths(keys)]),
+        *override_trailers(decision.overrides, keys),
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return compose(paragraphs, trailers)
 
 
-def _list(head: str, items: Iterable[object]) -> list[str]:
-    lines = [f"  {item}" for item in items]
-    return [head, *lines] if lines else []
+def time_text(at: datetime) -> str:
+    return at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
 _VERBS = {
@@ -135,47 +199,47 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
     return tuple(sorted({who for claim in claims if claim for who in claim.requesters}))
 
 
-def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
+def _told(
+    decision: Decision, requesters: tuple[str, ...], received: datetime
+) -> tuple[str, str, list[tuple[str, str]]]:
+    # the title, the reason, and the trailers of this operation
     request, changes = decision.request, decision.changes.claims
     kinds = Counter(subject.kind for subject in decision.changes.subjects())
     counts = [(kinds[kind], kind.value[:-1]) for kind in SubjectKind if kinds[kind]]
     what = " and ".join(f"{count} {kind}{'s' if count > 1 else ''}" for count, kind in counts)
-    what_of_whom = f"{what} in the name of {', '.join(_requesters(decision))}"
+    what_of_whom = f"{what} in the name of {', '.join(requesters)}"
     subjects = ", ".join(subject.id for subject in decision.changes.subjects())
-    time = revisions.format_time(received)
+    time = time_text(received)
     if isinstance(request, Restoration):
         to = request.to[:12]
-        return f"Roll back to {to}", (
-            f"{request.by} rolled the ledger back to commit {to}, which changes {what}: "
-            f"{request.reason}"
-        )
+        why = f"{request.by} rolled the ledger back to commit {to}, which changes {what}: "
+        trailers = [("Restores", request.to), ("Reason", request.reason)]
+        return f"Roll back to {to}", why + request.reason, trailers
     if request.operation == "expire":
         claims = [change.before for change in changes]
         last = max(claim.lease.expires_at for claim in claims if claim and claim.lease)
-        return f"Expire {subjects}", (
-            f"the lease of demand '{request.demand}' on {what_of_whom} ended at "
-            f"{revisions.format_time(last)} and was not renewed."
-        )
+        why = f"the lease of demand '{request.demand}' on {what_of_whom} ended at "
+        return f"Expire {subjects}", f"{why}{time_text(last)} and was not renewed.", []
     if isinstance(request, Drain):
         moved = "".join(f" {text[0].upper()}{text[1:]}." for text in request.moved)
-        return f"Drain {request.id}", f"'{request.id}' is drained in the inventory.{moved}"
+        why = f"'{request.id}' is drained in the inventory.{moved}"
+        return f"Drain {request.id}", why, [("Node", request.id)]
     if isinstance(request, Decommission):
         by = f" by {request.by}" if request.by else ""
         reason = f" ({request.reason})" if request.reason else ""
         held = f"it held a part of {what_of_whom}" if changes else "its demands waited for room"
-        return f"Decommission {request.id}", (
-            f"'{request.id}' was decommissioned{by} on {time}{reason}; {held}."
-        )
+        why = f"'{request.id}' was decommissioned{by} on {time}{reason}; {held}."
+        nodes, claims = request.nodes or (request.id,), [change.before for change in changes]
+        needed = any(claim.held.needs(node) for claim in claims if claim for node in nodes)
+        trailers = [("Node", request.id)] if needed and "node" in request.kinds else []
+        return f"Decommission {request.id}", why, [*trailers, ("Reason", request.reason)]
     if isinstance(request, Wait):
         who, reasons = ", ".join(request.requesters()), "; ".join(request.reasons)
-        return f"Let {request.demand} wait", (
-            f"request '{request.id}' of demand '{request.demand}' in the name of {who}, received "
-            f"{time}, waits for room: {reasons}."
-        )
+        why = f"request '{request.id}' of demand '{request.demand}' in the name of {who}, received "
+        return f"Let {request.demand} wait", f"{why}{time}, waits for room: {reasons}.", []
     if not changes:
-        return f"Release {', '.join(decision.changes.waiting)}", (
-            f"request '{request.id}', received {time}, releases demands that waited for room."
-        )
+        why = f"request '{request.id}', received {time}, releases demands that waited for room."
+        return f"Release {', '.join(decision.changes.waiting)}", why, []
     only_leases = all(
         change.before and change.after and change.before.booked == change.after.booked
         for change in changes
@@ -186,22 +250,7 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
     why = f"request '{request.id}'{named}, received {time}, {verb} {what_of_whom}."
     placed = "".join(f" {text[0].upper()}{text[1:]}." for text in decision.placed)
     placed += " It waited for room." if request.demand in decision.changes.waiting else ""
-    return f"{title} {subjects}", why + placed
-
-
-def _operation_trailers(decision: Decision) -> list[tuple[str, str]]:
-    request = decision.request
-    if isinstance(request, Restoration):
-        return [("Restores", request.to), ("Reason", request.reason)]
-    if isinstance(request, Drain):
-        return [("Node", request.id)]
-    if not isinstance(request, Decommission):
-        return []
-    reason = [("Reason", request.reason)]
-    claims = [change.before for change in decision.changes.claims]
-    nodes = request.nodes or (request.id,)
-    needed = any(claim.held.needs(node) for claim in claims if claim for node in nodes)
-    return ([("Node", request.id)] if needed and "node" in request.kinds else []) + reason
+    return f"{title} {subjects}", why + placed, []
 
 
 def of_follow(
@@ -226,7 +275,9 @@ def of_follow(
         [title],
         [f"Why: commits up to {cause[:12]} changed configuration, ledger or generated files."],
         _desired_state(releases) if releases else [],
-        _list("Not applied, because not valid:", problems),
+        ["Not applied, because not valid:", *(f"  {each}" for each in problems)]
+        if problems
+        else [],
     ]
     trailers = [
         ("Operation", "follow"),
@@ -253,7 +304,7 @@ def of_override_end(
     ]
     trailers = [
         ("Operation", "expire-override"),
-        *override_trailers([override.path, *keep_override_paths(keys)]),
+        *override_trailers([override.path], keys),
         *demand_trailers(keys),
         *more,
         ("Render-Version", str(RENDER_VERSION)),
@@ -261,13 +312,11 @@ def of_override_end(
     return compose(paragraphs, trailers)
 
 
-def override_trailers(paths: Iterable[str]) -> list[tuple[str, str]]:
-    return [("Override", path) for path in sorted(set(paths))]
-
-
-def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
+def override_trailers(paths: Iterable[str], keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
+    # ``keys`` are those of changed claims, among them those of ``keep`` overrides
     demands = (key.demand for key in keys if key.demand.startswith(OVERRIDE_PREFIX))
-    return [f"{OVERRIDES_ROOT}/{demand.removeprefix(OVERRIDE_PREFIX)}.yaml" for demand in demands]
+    keeping = (f"{OVERRIDES_ROOT}/{name.removeprefix(OVERRIDE_PREFIX)}.yaml" for name in demands)
+    return [("Override", path) for path in sorted({*paths, *keeping})]
 
 
 def demand_trailers(keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
@@ -285,90 +334,3 @@ def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
         lines.append(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
         lines += [f"      {detail}" for detail in release.details]
     return lines
-
-
-# ---- authors: who made a commit or caused a follow commit, and who runs this program ----
-#
-# A follow commit is made by the generator, and renders what people committed. Its trailers name
-# people's commits, and its author names these people. A commit is by a person if no generator on
-# any machine made it, or if it is of a proposal (:mod:`.commit_log`).
-
-_ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
-_MOST_NAMED = 20
-_NO_ADDRESS = "@demandops.invalid"
-
-
-class Person(NamedTuple):
-    name: str
-    email: str
-
-    @property
-    def is_known(self) -> bool:
-        # if git knows no address, it is ``<login>@demandops.invalid``
-        return not self.email.endswith(_NO_ADDRESS)
-
-    def __str__(self) -> str:
-        return f"{self.name} <{self.email}>"
-
-
-def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
-    commits = commit_log.person_commits(repo, to, known)
-    return [commit for commit in commits if _touches(commit, _ROOTS)]
-
-
-def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
-    # A fault is caused by the last person's commit that changed its file, else by the last one that
-    # changed any file of the generator. The function returns the commit's id and author.
-
-    @cache  # the commits are read only when needed: most problems are already in the report
-    def commits() -> list[Commit]:
-        return list(commit_log.person_commits(repo, to, known))
-
-    def origin(path: str) -> tuple[str, str] | None:
-        for paths in ((path,) if path else (), _ROOTS):
-            for commit in commits():
-                if _touches(commit, paths):
-                    return str(commit.id), str(author_of(commit))
-        return None
-
-    return origin
-
-
-def _touches(commit: Commit, paths: Iterable[str]) -> bool:
-    return trees.differ(trees.parent_tree(commit), commit.tree, paths)
-
-
-def author_of(commit: Commit) -> Person:
-    plain = signature(*commit_log.author_of(commit), commit_log.time_of(commit))
-    return Person(plain.name, plain.email)
-
-
-def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
-    # of the newest causes, whose newest is first, in time's order
-    named = reversed(causes[:_MOST_NAMED])
-    return [("Caused-By", f"{commit.id} {author_of(commit)}") for commit in named]
-
-
-def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
-    if not causes:
-        return generator_signature(now)
-    people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))
-    names = ", ".join(dict.fromkeys(person.name for person in people))
-    # one person's own address, so that `git log --author` finds the follow commit too
-    email = people[0].email if len(people) == 1 else commit_log.GENERATOR_EMAIL
-    return signature(names, email, commit_log.time_of(causes[0]))
-
-
-def operator(folder: str | None = None) -> Person:
-    try:
-        login = getpass.getuser()
-    except (KeyError, OSError):  # a container's user has no passwd entry
-        login = "unknown"
-
-    def configured(variable: str, key: str) -> str:
-        setting = git.Git(folder).config("--get", key, with_exceptions=False)
-        return os.environ.get(variable) or str(setting)
-
-    name = configured("GIT_AUTHOR_NAME", "user.name") or login
-    email = configured("GIT_AUTHOR_EMAIL", "user.email") or f"{login}{_NO_ADDRESS}"
-    return Person(name, email)

@@ -19,6 +19,7 @@ from demandops.base.quoting import quoted
 from demandops.model.config.base_model import seconds_of
 from demandops.repo.git.tree import commit_of
 from demandops.repo.history import commit_log
+from demandops.repo.history.commit_message import time_text
 
 # Examples of the times that parse_time accepts.
 TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago)"
@@ -98,8 +99,8 @@ def _commit_named(
             if commit.commit_time <= latest:
                 return commit
         raise StateRepoError(
-            f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
-            f"{format_time(commit_log.time_of(commit))}"
+            f"at {time_text(at)} the state repo did not exist yet; its first commit is of "
+            f"{time_text(commit_log.time_of(commit))}"
         )
     commits = {name: repo.references[name].peel(Commit) for name in names}
     if base == "HEAD":
@@ -137,7 +138,3 @@ def _names(repo: Repository, base: str) -> list[str]:
     names = [name for name in valid if name in repo.references]
     tracked = f"refs/remotes/origin/{base}"  # as in a clone, or a checkout of another branch
     return names or [tracked for _ in valid[:1] if tracked in repo.references]
-
-
-def format_time(at: datetime) -> str:
-    return at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")

@@ -18,7 +18,7 @@ from demandops.model.ledger.claim import Claim, ClaimKey
 from demandops.model.ledger.ledger import ClaimChange, Ledger
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo.git import tree as trees
-from demandops.repo.history import commit_log
+from demandops.repo.history import commit_log, commit_message
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +133,7 @@ def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
         for commit in commit_log.person_commits(repo, to, since)
         # a merge, or what keeps a proposal's trailers, may add what a generator has proposed
         if len(commit.parents) == 1
-        and commit_log.PROPOSAL not in commit_log.entry_of(commit).trailers
+        and commit_message.PROPOSAL not in commit_log.entry_of(commit).trailers
         for path in changed_files(commit.parents[0].tree, commit.tree)
     }
     claims = (valid_claim_at(after, path) for path in paths if not trees.entry(before, path))

@@ -29,7 +29,7 @@ from demandops.model.release import Release, ServiceRelease
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import reading, unopened
 from demandops.repo.history import revisions
-from demandops.repo.load import state_in_effect
+from demandops.repo.load import snapshot as snapshots
 
 # ---- overrides in place of manual edits, for values, replicas and images ----
 #
@@ -260,7 +260,7 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
             name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
             base = replace(base, target=name, newer=newer, merged=merged)
         try:
-            snapshot = state_in_effect.state_at(repo, commit.id)
+            snapshot = snapshots.state_at(repo, commit.id)
         except (InvalidInput, StateRepoError):
             return base
         return replace(base, state=snapshot.state, valid=not snapshot.problems)

@@ -21,8 +21,7 @@ from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.base.strict_yaml import with_lines
 from demandops.decide import changeset, warnings
 from demandops.decide.changeset import MergePreview
-from demandops.decide.decision import faults_of_edit
-from demandops.decide.placement.relocation import expired_overrides, update_ledger
+from demandops.decide.edits import expired_overrides, faults_of_edit, update_ledger
 from demandops.decide.state import State, rendered_files, try_configuration
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
@@ -139,6 +138,7 @@ def check(
                 *warnings.policy_warnings(state),
                 *warnings.unmatched_pattern_warnings(state.config),
                 *warnings.misspelled_topic_warnings(state),
+                *warnings.unheld_output_warnings(state),
                 *edit.changed_bootstraps(wanted),
                 *(
                     topic.warning

@@ -35,8 +35,7 @@ from demandops.decide.state import State
 from demandops.model.config.config import DOMAINS_FILE
 from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease
-from demandops.render.gitops import path_of
-from demandops.render.manifests import values_of
+from demandops.render.gitops import path_of, values_of
 from demandops.repo.merge_check.helm import HELM_BIN, Helm, Report
 from demandops.templating import charts
 from demandops.templating.values import SchemaTask

@@ -19,23 +19,23 @@ from pygit2 import Signature
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.quoting import one_line
 from demandops.base.settings import GENERATED_ROOTS
+from demandops.decide import edits
 from demandops.decide.booking import Drain
 from demandops.decide.changeset import Change, Changeset, ReleaseChange
-from demandops.decide.decision import Decision, changeset_of_edit, decide
-from demandops.decide.placement import relocation
+from demandops.decide.decision import Decision, decide
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import NODES_FILE
 from demandops.model.config.override import Override
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import claim_changes
-from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
+from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
-from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
+from demandops.repo.load import last_valid_config, ledger_files
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Advance, Snapshot
-from demandops.repo.write.journal import ProposalRecord
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02
@@ -73,15 +73,9 @@ class CommitBatch:
         operation: str,
         received: datetime,
         now: datetime,
-        proposal: ProposalRecord | None = None,
+        more: commit_message.Trailers = (),
     ) -> str:
-        more = [*self._settled, *state_in_effect.trailers_of(self.head)]
-        if proposal:
-            more += [
-                (commit_log.PROPOSAL, proposal.branch),
-                (commit_log.REPLACES, proposal.replaces),
-                *((commit_log.REQUIRED_BY, reason) for reason in decision.approval),
-            ]
+        more = [*self._settled, *snapshots.trailers_of(self.head), *more]
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
         self.awaited = self.awaited or decision.awaited
@@ -99,9 +93,9 @@ class CommitBatch:
         committer = commit_message.generator_signature(now)
         for attempt in range(1, _ATTEMPTS + 1):
             try:
-                tree = trees.write(self._repository.new, self._tree, files)
-                commit = signing.create_commit(
-                    self._repository.new,
+                new = self._repository.new
+                tree = new.add_tree(self._tree, files)
+                commit = new.add_commit(
                     self._repository.signer,
                     (author, committer),
                     text,
@@ -110,7 +104,7 @@ class CommitBatch:
                 )
                 self._tree = trees.commit_of(self._objects, commit).tree
                 break
-            except signing.SigningFailed:
+            except SigningFailed:
                 raise
             except (OSError, pygit2.GitError, KeyError, StateRepoError):
                 # a concurrent `git gc` may move an object to another file while it is read
@@ -133,9 +127,7 @@ class CommitBatch:
         self.head, change, keys = self._followed(advance, before, now)
         state, tip, problems = self.head.state, self.head.commit, self.head.problems
         files, reported = dict(change.files), self.read(last_valid_config.PATH)
-        origin = commit_message.fault_origin(
-            self._objects, before.last_valid_commit, self.start.commit
-        )
+        origin = commit_log.fault_origin(self._objects, before.last_valid_commit, self.start.commit)
         report = last_valid_config.write(
             last_valid_config.with_origins(problems, last_valid_config.read(reported), origin)
         )
@@ -144,37 +136,37 @@ class CommitBatch:
         if not files:
             return
         overrides = [
-            *relocation.changed_override_files(before.state, state),
+            *edits.changed_override_files(before.state, state),
             *change.overrides,
-            *commit_message.keep_override_paths(keys),
         ]
-        causes = commit_message.person_commits_since(self._objects, before.last_valid_commit, tip)
+        of_overrides = commit_message.override_trailers(overrides, keys)
+        causes = commit_log.person_commits_since(self._objects, before.last_valid_commit, tip)
         text = commit_message.of_follow(
             change.releases,
             str(tip),
             str(before.commit),
             problems,
             [
-                *commit_message.override_trailers(overrides),
+                *of_overrides,
                 *commit_message.demand_trailers(keys),
-                *commit_message.caused_by_trailers(causes),
-                *state_in_effect.trailers_of(self.head),
+                *commit_log.caused_by_trailers(causes),
+                *snapshots.trailers_of(self.head),
             ],
             reports=report != reported,
         )
-        author = commit_message.follow_author(causes, now)
+        author = commit_log.follow_author(causes, now)
         self.commit_files(files, state, text, author, now)
         title = text.partition("\n")[0]
-        self.followed = one_line(", ".join([title, *sorted(set(overrides))]))
+        self.followed = one_line(", ".join([title, *(path for _, path in of_overrides)]))
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
-        judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
+        judgement = snapshots.judge(self._objects, advance, before, self._tree)
         accepted, change = judgement.with_new_config(), None
         if advance.config_changed:
             try:
                 marked = last_valid_config.end_markers_at(self._tree)
                 state, subjects = accepted.snapshot.state, accepted.subjects
-                applied = relocation.update_ledger(before.state, state, subjects, marked, now)
+                applied = edits.update_ledger(before.state, state, subjects, marked, now)
                 state = replace(state, ledger=applied.ledger)
                 change = self.render_all(state, applied.files)
             except InvalidInput as error:
@@ -182,11 +174,11 @@ class CommitBatch:
         if change is None:
             # with the configuration as before, only the subjects that people changed are rendered
             state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
-            applied = relocation.update_claims(old, state, subjects, now)
+            applied = edits.update_claims(old, state, subjects, now)
             touched = claim_changes(state.ledger, applied.ledger, applied.keys)
             state = state.with_ledger(applied.ledger, touched)
             subjects = tuple(dict.fromkeys((*subjects, *(edit.key.subject for edit in touched))))
-            change = changeset_of_edit(state, old, subjects, self.read)
+            change = edits.changeset_of_edit(state, old, subjects, self.read)
             change = replace(change, files={**applied.files, **change.files})
         # an approved claim's lease starts only now, because else it could end before the approval
         snapshot, ledger, files = accepted.snapshot, state.ledger, dict(change.files)
@@ -203,10 +195,10 @@ class CommitBatch:
 
     def end_override(self, override: Override, now: datetime) -> None:
         # InvalidInput is raised if the state without the override cannot be planned or rendered
-        applied = relocation.end_override(self.head.state, override, now)
+        applied = edits.end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
-        more = state_in_effect.trailers_of(self.head)
+        more = snapshots.trailers_of(self.head)
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
 
@@ -220,10 +212,10 @@ class CommitBatch:
             changes = commit_log.changes_to(self._objects, self.start.commit, file)
             by_people = (change.entry for change in changes if not change.entry.by_generator)
             causes = [trees.commit_of(self._objects, e.commit) for e in islice(by_people, 1)]
-            caused_by = commit_message.caused_by_trailers(causes)
-            more = [*caused_by, *state_in_effect.trailers_of(self.head)]
+            caused_by = commit_log.caused_by_trailers(causes)
+            more = [*caused_by, *snapshots.trailers_of(self.head)]
             text = commit_message.of_decision(decision, operation, now, more)
-            author = commit_message.follow_author(causes, now)
+            author = commit_log.follow_author(causes, now)
             self.commit_files(decision.files, decision.state, text, author, now)
         return decision
 

@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import IO, Any
@@ -70,19 +70,9 @@ class ProposalRecord:
         return f"{self.branch} {self.commits[-1]}" if self.commits else self.replaces
 
 
-@dataclass(frozen=True, slots=True)
-class JournalEntry:
-    operation: str
-    goal: Any
-    received: str
-    base: str
-    proposal: ProposalRecord | None = None
-
-    def record(self) -> dict[str, Any]:
-        # asdict would copy the goal, which may be nested too deeply for that
-        record = {field.name: getattr(self, field.name) for field in fields(self)}
-        del record["proposal"]
-        return record | ({"proposal": asdict(self.proposal)} if self.proposal else {})
+# A line about a demand: operation, goal, received, base, and perhaps proposal, a ProposalRecord.
+Record = dict[str, Any]
+_KEYS = {"operation", "goal", "received", "base"}
 
 
 class Journal:
@@ -101,17 +91,16 @@ class Journal:
         if self._unsound is not None:
             raise self._unsound
 
-    def append(self, entries: Iterable[JournalEntry]) -> None:
-        """Write and fsync all ``entries``, or raise StateRepoError and write none of them.
+    def append(self, records: Iterable[Record]) -> None:
+        """Write and fsync all ``records``, or raise StateRepoError and write none of them.
 
         Unsound is raised if nobody knows whether they are written.
         """
-        entries = list(entries)
-        if entries:
+        records = list(records)
+        if records:
             with self._explained():
-                self._write([entry.record() for entry in entries], durably=True)
-            self.pending.update((entry.operation, entry) for entry in entries)
-            self._rewrite_if_large()
+                self._write(records, durably=True)
+            self.pending.update((record["operation"], record) for record in records)
 
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         # With ``durably``, the removal is fsynced, and a failure raises StateRepoError and keeps
@@ -128,7 +117,6 @@ class Journal:
         if done and not durably:
             with suppress(OSError):
                 self._write(records, durably=False)
-        self._rewrite_if_large()
 
     def close(self) -> None:
         # if this fails, the next process may evaluate again a demand that is done
@@ -136,8 +124,11 @@ class Journal:
             self._write([], durably=True)
         self._file.close()
 
-    def _write(self, records: list[dict[str, Any]], *, durably: bool) -> None:
+    def _write(self, records: list[Record], *, durably: bool) -> None:
         self.require_sound()
+        if self._size > self._limit:
+            with suppress(OSError):  # the next write tries again
+                self._rewrite()
         if self._is_broken:
             self._rewrite()
         text, chain = _sealed(records, self._chain)
@@ -161,13 +152,8 @@ class Journal:
             raise
         self._is_broken, self._chain, self._size = False, chain, self._size + len(text)
 
-    def _rewrite_if_large(self) -> None:
-        if self._size > self._limit:
-            with suppress(OSError):  # the next write tries again
-                self._rewrite()
-
     def _rewrite(self) -> None:
-        text, chain = _sealed([entry.record() for entry in self.pending.values()], "")
+        text, chain = _sealed(self.pending.values(), "")
         if text:
             fresh = self._path.with_suffix(".new")
             with fresh.open("wb") as writing:
@@ -206,14 +192,14 @@ class Journal:
             ) from None
 
 
-def read(path: Path) -> dict[str, JournalEntry]:
+def read(path: Path) -> dict[str, Record]:
     return parse(path.read_bytes() if path.exists() else b"", path)
 
 
-def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
+def parse(text: bytes, path: Path) -> dict[str, Record]:
     *lines, last = text.split(b"\n")
     chain = "" if _SEALED.fullmatch((lines or [last])[0]) else None
-    pending: dict[str, JournalEntry] = {}
+    pending: dict[str, Record] = {}
     for number, line in enumerate(lines, start=1):
         try:
             chain = _apply(line, chain, pending)
@@ -228,45 +214,44 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
     return pending
 
 
-def _sealed(records: Iterable[dict[str, Any]], chain: str) -> tuple[bytes, str]:
+def _sealed(records: Iterable[Record], chain: str) -> tuple[bytes, str]:
     # the lines after one with the digest ``chain``, and the last digest
     lines = []
     for record in records:
-        body = json.dumps(record, ensure_ascii=True)
-        chain = _digest(body.encode(), chain)
+        body = json.dumps(record, ensure_ascii=True, default=asdict)
+        chain = hashlib.sha256(f"{chain}{body}".encode()).hexdigest()
         lines.append(f'{body[:-1]}, "digest": "{chain}"}}\n')
     return "".join(lines).encode(), chain
 
 
-def _digest(body: bytes, chain: str) -> str:
-    return hashlib.sha256(chain.encode() + body).hexdigest()
-
-
-def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> str | None:
+def _apply(line: bytes, chain: str | None, pending: dict[str, Record]) -> str | None:
     if chain is not None:  # else a journal of the first version, which has no digests
         sealed = _SEALED.fullmatch(line)
-        if sealed is None or _digest(sealed[1] + b"}", chain) != sealed[2].decode():
+        line = sealed[1] + b"}" if sealed else b""
+        digest = hashlib.sha256(chain.encode() + line).hexdigest()
+        if sealed is None or digest != sealed[2].decode():
             raise ValueError("the line has another digest")
-        line, chain = sealed[1] + b"}", sealed[2].decode()
+        chain = digest
     _replay(line, pending)
     return chain
 
 
-def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
+def _replay(body: bytes, pending: dict[str, Record]) -> None:
     try:
         record = json.loads(body)
         if record.keys() == {"done"}:
             pending.pop(record["done"], None)
             return
         if (proposal := record.pop("proposal", None)) is not None:
-            proposal = ProposalRecord(**{**proposal, "commits": tuple(proposal["commits"])})
-        entry = JournalEntry(**record, proposal=proposal)
-        if not isinstance(entry.operation, str) or not isinstance(entry.base, str):
-            raise ValueError("an id is no text")
-        received = datetime.fromisoformat(entry.received)
+            commits = tuple(proposal["commits"])
+            proposal = {"proposal": ProposalRecord(**{**proposal, "commits": commits})}
+        operation, base = record["operation"], record["base"]
+        if record.keys() != _KEYS or not isinstance(operation, str) or not isinstance(base, str):
+            raise ValueError("a key is missing or unknown, or an id is no text")
+        received = datetime.fromisoformat(record["received"])
         if received.tzinfo is None or not 1970 <= received.year < UNSTARTED.year:
             raise ValueError("the time has no zone, or a year that no generator writes")
-        pending[entry.operation] = entry
+        pending[operation] = record | (proposal or {})
     except (TypeError, LookupError, AttributeError, RecursionError) as error:
         raise ValueError("the line is not an entry") from error
 
@@ -321,7 +306,7 @@ class Slot:
 @dataclass(frozen=True, slots=True)
 class FoundJournal:
     file: Path
-    demands: list[JournalEntry]  # that are not done and can be read
+    demands: list[Record]  # that are not done and can be read
     damage: str = ""  # the error of reading the journal, if any
     set_aside: Path | None = None  # the file's new path, if it was renamed
 
@@ -344,7 +329,7 @@ def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[Fou
                 with lock:
                     moved = file.rename(file.with_name(f"outbox-{now:%Y%m%dT%H%M%S}.damaged"))
                     sync_folder(file.parent)
-            pending: dict[str, JournalEntry] = {}
+            pending: dict[str, Record] = {}
             for line in (moved or file).read_bytes().split(b"\n"):
                 sealed = _SEALED.fullmatch(line)
                 with suppress(ValueError):

@@ -17,12 +17,11 @@ from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.changeset import FileReader
-from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import MAIN, StateRepository
 from demandops.repo.history import commit_message
-from demandops.repo.history.commit_log import compose
-from demandops.repo.history.commit_message import Person
+from demandops.repo.history.commit_log import Person
+from demandops.repo.history.commit_message import compose
 from demandops.repo.load import last_valid_config
 from demandops.repo.write.proposal_branch import PendingProposal, ProposalBranches
 
@@ -153,15 +152,13 @@ def _commit(
     parents: list[Oid],
     details: CommitDetails,
 ) -> Oid:
-    tree = trees.write(repository.new, tip.tree, dict(files))
+    tree = repository.new.add_tree(tip.tree, files)
     # faults that main has already do not stop a person, who may be mending them one by one
     new_faults = _config_faults(repository.objects[tree].peel(Tree)) - _config_faults(tip.tree)
     if new_faults:
         raise InvalidInput(sorted(new_faults, key=str))
     who = commit_message.signature(*details.person, details.now)
-    return signing.create_commit(
-        repository.new, repository.signer, (who, who), details.text, tree, parents
-    )
+    return repository.new.add_commit(repository.signer, (who, who), details.text, tree, parents)
 
 
 def _config_faults(tree: Tree) -> set[Fault]:

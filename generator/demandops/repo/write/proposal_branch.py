@@ -26,7 +26,7 @@ from demandops.repo.git import tree as trees
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.git.repository import MAIN, PushDenied, StateRepository
 from demandops.repo.git.tree import commit_of
-from demandops.repo.history import commit_log
+from demandops.repo.history import commit_log, commit_message
 from demandops.repo.load import ledger_files
 
 log = logging.getLogger("demandops")
@@ -179,7 +179,7 @@ class ProposalBranches:
         except StateRepoError:
             return None  # the clone was made again, or `git gc` removed the commit
         now = commit_of(objects, tip).tree
-        return old, proposal, now, objects[trees.write(self._repository.new, now, files)].peel(Tree)
+        return old, proposal, now, objects[self._repository.new.add_tree(now, files)].peel(Tree)
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +219,7 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
         except (KeyError, ValueError, TypeError, GitError, StateRepoError):
             _warn_of_unreadable(name)
             continue
-        entries = [entry for _, entry in commits if commit_log.PROPOSAL in entry.trailers]
+        entries = [entry for _, entry in commits if commit_message.PROPOSAL in entry.trailers]
         if not entries:
             continue
         yield PendingProposal(
@@ -230,8 +230,8 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
             requesters=_all_of(entries, "Requester"),
             demands=_all_of(entries, "Demand-Id"),
             operations=_all_of(entries, "Operation-Id"),
-            required_by=_all_of(entries, commit_log.REQUIRED_BY),
-            replaces=_all_of(entries, commit_log.REPLACES),
+            required_by=_all_of(entries, commit_message.REQUIRED_BY),
+            replaces=_all_of(entries, commit_message.REPLACES),
         )
 
 

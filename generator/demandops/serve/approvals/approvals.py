@@ -27,7 +27,7 @@ from demandops.model.demand.demand import Demand
 from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.git.repository import PushDenied, StateRepository
 from demandops.repo.git.signing import SigningFailed
-from demandops.repo.history import commit_log
+from demandops.repo.history import commit_log, commit_message
 from demandops.repo.history.commit_log import RecordedOutcome
 from demandops.repo.load import ledger_files
 from demandops.repo.load.snapshot import Snapshot
@@ -39,7 +39,7 @@ from demandops.repo.write.proposal_branch import (
     ProposalBranches,
     branch_name,
 )
-from demandops.serve.approvals.forge_worker import CheckTimer, ForgeWorker
+from demandops.serve.approvals.forge_worker import ForgeWorker
 from demandops.serve.approvals.proposal import (
     Proposal,
     Verdict,
@@ -53,8 +53,7 @@ from demandops.serve.approvals.proposal import (
     releases,
     waiting_text,
 )
-from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
-from demandops.serve.queue import Receipt, Ticket, receipt_of
+from demandops.serve.demands import TAKEN_BACK, Demands, Receipt, Ticket
 
 log = logging.getLogger("demandops")
 
@@ -80,28 +79,27 @@ class Approvals:
         self._repository, self._runtime = repository, repository.runtime
         self._demands = demands
         self._with_targets = with_targets
-        self._branches = ProposalBranches(repository)
+        self.branches = ProposalBranches(repository)
 
         def on_update(branch: str) -> None:
             self._changed.append(branch)  # in the forge's thread; a deque needs no lock for it
             demands.wake()
 
         self._forge = ForgeWorker(token_file, on_update, repository.runtime)
-        self._timer = CheckTimer(repository.runtime, local=repository.always_current)
-        self._proposals: dict[str, Proposal] = {}  # by branch
+        self.proposals: dict[str, Proposal] = {}  # by branch
         self._changed: deque[str] = deque()
         for ticket in demands.proposed:  # of an earlier run
             request = admit_or_none(state, ticket.demand)
             record = replace(ticket.proposal or ProposalRecord(""), withdrawn="")
             new = Proposal(record, searched_to=ticket.base)
-            proposal = self._proposals.setdefault(record.branch, new)
+            proposal = self.proposals.setdefault(record.branch, new)
             if ticket.state == "proposed":  # a withdrawn ticket has an older record
                 proposal.record = record
             proposal.tickets.append(ticket)
             proposal.requests += [request] if request else []
             self._changed.append(proposal.branch)
-        for proposal in self._proposals.values():  # the last run may have ended in `add`
-            if old := self._proposals.get(proposal.record.replaced_branch):
+        for proposal in self.proposals.values():  # the last run may have ended in `add`
+            if old := self.proposals.get(proposal.record.replaced_branch):
                 self._replace(old, proposal.branch)
 
     # ---- while a batch is evaluated ----
@@ -109,15 +107,15 @@ class Approvals:
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
         # Before the batch is evaluated: once a branch is gone, nobody can merge it. If a person
         # merged it earlier, the batch is evaluated on a tip that includes the merge.
-        for ticket in batch if self._proposals else ():
+        for ticket in batch:
             if (request := _release_request(ticket, state)) is None:
                 continue
-            for proposal in self._proposals.values():
+            for proposal in self.proposals.values():
                 if not releases(request, proposal.requests, state.config):
                     continue
                 self._demands.withdraw_proposed(proposal.tickets, RELEASED)
                 if proposal.record.commits:
-                    self._delete_branch(proposal.branch, self._branches.heads())
+                    self._delete_branch(proposal.branch, self.branches.heads())
                 # the next check answers the demands, because their branch may be merged already
                 self._changed.append(proposal.branch)
                 ticket.has_released = True
@@ -147,7 +145,7 @@ class Approvals:
         proposal = next((old for old in waiting if goal in old.goals()), None)
         replaced = waiting if request.operation == "put" and proposal is None else []
         if proposal is None:
-            open_proposals = [other for other in self._proposals.values() if other.waits]
+            open_proposals = [other for other in self.proposals.values() if other.waits]
             counts = Counter(name for other in open_proposals for name in other.requesters())
             names = request.requesters()
             full = next((name for name in names if counts[name] >= PROPOSAL_LIMIT), "")
@@ -160,7 +158,7 @@ class Approvals:
                 self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
                 return
             branch = branch_name(request.demand or request.id, ticket.operation)
-            if branch in self._proposals:
+            if branch in self.proposals:
                 self._demands.fail([ticket], _belongs_to_another(branch))
                 return
             replaces = next((old.record.as_replaced() for old in replaced), "")
@@ -168,7 +166,7 @@ class Approvals:
         if not self._demands.propose(ticket, proposal.record):
             self._demands.fail([ticket], errors.Withdrawn(TAKEN_BACK))
             return
-        self._proposals[proposal.branch] = proposal
+        self.proposals[proposal.branch] = proposal
         proposal.tickets.append(ticket)
         proposal.requests.append(request)
         self._changed.append(proposal.branch)
@@ -177,7 +175,7 @@ class Approvals:
 
     def _waiting(self, request: Demand) -> list[Proposal]:
         key = key_of(request)
-        waiting = (proposal for proposal in self._proposals.values() if proposal.waits)
+        waiting = (proposal for proposal in self.proposals.values() if proposal.waits)
         return [proposal for proposal in waiting if key in map(key_of, proposal.requests)]
 
     def refuse_strangers(self, decision: Decision) -> None:
@@ -189,7 +187,7 @@ class Approvals:
 
     def withdraw_replaced(self, request: Demand) -> None:
         # by a put that needs no approval
-        for proposal in self._waiting(request) if request.operation == "put" else ():
+        for proposal in self._waiting(request):
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
 
     def _replace(self, old: Proposal, branch: str) -> None:
@@ -198,35 +196,24 @@ class Approvals:
 
     # ---- after main was read ----
 
-    def is_due(self, tip: str) -> bool:
-        if not self._proposals:
-            return False
-        tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)
-        withdrawn = any(ticket.state == "withdrawn" for ticket in tickets)
-        return self._timer.is_due(tip, has_news=bool(self._changed) or withdrawn)
-
-    def seconds_until_due(self, tip: str, longest: float) -> float:
-        if not self._proposals:
-            return longest
-        return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
-
-    def fetch_heads(self) -> BranchHeads:
-        self._timer.began()  # this plans the next check, in case the fetch fails
-        return self._branches.heads()
+    @property
+    def has_news(self) -> bool:
+        tickets = (ticket for proposal in self.proposals.values() for ticket in proposal.tickets)
+        return bool(self._changed) or any(ticket.state == "withdrawn" for ticket in tickets)
 
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
         # It answers the demands that are decided or withdrawn, and updates the other proposals.
         # ``snapshot`` is of main, at ``heads.main`` or later. After an error, the next one goes on.
         while self._changed:
-            if changed := self._proposals.get(self._changed.popleft()):
+            if changed := self.proposals.get(self._changed.popleft()):
                 changed.checked_at = ""
-        began, proposals = self._runtime.monotonic(), list(self._proposals.values())
+        began, proposals = self._runtime.monotonic(), list(self.proposals.values())
         for number, proposal in enumerate(proposals):
             is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
             if number and is_long and self._demands.has_queued:
                 # make another check due, which begins with the rest
                 unchecked = {later.branch: later for later in proposals[number:]}
-                self._proposals = unchecked | self._proposals
+                self.proposals = unchecked | self.proposals
                 self._changed.append(proposal.branch)
                 break
             self._repository.while_waiting()
@@ -243,7 +230,6 @@ class Approvals:
                 else:
                     self._demands.fail(proposal.tickets, error)
                     self._forget(proposal, str(error))
-        self._timer.ended(str(snapshot.commit))
 
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
         objects, tip = self._repository.objects, str(snapshot.commit)
@@ -251,7 +237,7 @@ class Approvals:
         head, added = heads.branches.get(proposal.branch, ""), set[ClaimKey]()
         if head and not proposal.record.commits:
             self._demands.fail(proposal.tickets, _belongs_to_another(proposal.branch))
-            self._proposals.pop(proposal.branch, None)
+            self.proposals.pop(proposal.branch, None)
             return
         # a person who edited or deleted the branch may have merged it without our operation ids
         if proposal.record.pushed and head not in proposal.record.commits:
@@ -308,8 +294,18 @@ class Approvals:
         return replace(receipt, outcome="booked")
 
     def receipt(self, ticket: Ticket, decision: Decision, commit: str, before: State) -> Receipt:
-        targets = targets_of_decision(before, decision) if self._with_targets else ()
-        return receipt_of(ticket, decision, commit, targets)
+        return Receipt(
+            operation=ticket.operation,
+            request_id=decision.request.id,
+            outcome=decision.outcome,
+            commit=commit,
+            warnings=decision.warnings,
+            not_held=decision.changes.not_held,
+            placed=decision.placed,
+            lease_s=decision.lease_s,
+            targets=targets_of_decision(before, decision) if self._with_targets else (),
+            changes=decision.changes.claims,
+        )
 
     # ---- the branch and its pull request ----
 
@@ -326,7 +322,7 @@ class Approvals:
             return False
         forge = snapshot.state.config.repo_settings.proposals
         if forge.forge in ("github", "gitea"):
-            message = self._branches.message(proposal.record.commits[-1])
+            message = self.branches.message(proposal.record.commits[-1])
             title, body = pull_request_texts(message)
             self._forge.open(forge, proposal.branch, title, body)
             if not self._forge.was_queried(proposal.branch):
@@ -348,21 +344,26 @@ class Approvals:
         old, tip = proposal.record, snapshot.commit
         head = heads.branches.get(old.branch, "")
         files = {path: text for _, step in steps for path, text in step.files.items()}
-        if head and self._branches.is_up_to_date(tip, head, old.base, files):
+        if head and self.branches.is_up_to_date(tip, head, old.base, files):
             return True
         # If the demands would now book something else, such as another node that was chosen, the
         # proposal moves to another branch: what was approved so far is not that.
-        if head and steps and not self._branches.books_the_same(tip, head, old.base, files):
+        if head and steps and not self.branches.books_the_same(tip, head, old.base, files):
             request, ticket = proposal.requests[0], proposal.tickets[0]
             branch = branch_name(request.demand or request.id, f"{ticket.operation} {head}")
             self._forget(proposal, f"main has changed, so it is proposed anew: {branch}")
             proposal.record = old = ProposalRecord(branch, replaces=f"{old.branch} {head}")
-            self._proposals[branch] = proposal
+            self.proposals[branch] = proposal
             head = ""
         now, branch = self._runtime.now(), old.branch
         for ticket, step in steps:
             if step.files:
-                commits.commit(step, ticket.operation, ticket.received, now, old)
+                more = [
+                    (commit_message.PROPOSAL, old.branch),
+                    (commit_message.REPLACES, old.replaces),
+                    *((commit_message.REQUIRED_BY, reason) for reason in step.approval),
+                ]
+                commits.commit(step, ticket.operation, ticket.received, now, more)
         commit = commits.head.commit
         # Journal both commits before the push: after a crash either may be the branch's head, and
         # a head that is not known here would be taken for a person's.
@@ -374,9 +375,9 @@ class Approvals:
             self._delete_replaced(proposal, heads)
         forge, options = snapshot.state.config.repo_settings.proposals, []
         if forge.forge == "gitlab":
-            message = self._branches.message(str(commit))
+            message = self.branches.message(str(commit))
             options = push_options(message, forge.labels)
-        link = self._branches.put(branch, commit, head, options)
+        link = self.branches.put(branch, commit, head, options)
         self._journal(proposal, replace(record, pushed=True, link=link or old.link))
         log.info("%s %s", branch, "was rebuilt" if head else "awaits approval")
         return True
@@ -389,25 +390,25 @@ class Approvals:
 
     def _delete_replaced(self, proposal: Proposal, heads: BranchHeads) -> None:
         # a replaced proposal that is still here deletes its branch itself, with its answers
-        if proposal.record.replaced_branch not in self._proposals:
+        if proposal.record.replaced_branch not in self.proposals:
             self._delete_branch(proposal.record.replaced_branch, heads)
 
     def _delete_branch(self, branch: str, heads: BranchHeads) -> None:
         if head := heads.branches.get(branch):
-            self._branches.remove(branch, head)
+            self.branches.remove(branch, head)
             del heads.branches[branch]
 
     # ---- the end ----
 
     def _forget(self, proposal: Proposal, closed_as: str) -> None:
-        self._proposals.pop(proposal.branch, None)
+        self.proposals.pop(proposal.branch, None)
         self._forge.forget(proposal.branch, code(closed_as) if closed_as else "")
 
     def suspend(self) -> None:
         error = errors.ShuttingDown("the demand awaits approval, and is resumed at the next start")
-        for proposal in self._proposals.values():
+        for proposal in self.proposals.values():
             self._demands.fail(proposal.tickets, error, keep=True)
-        self._proposals = {}
+        self.proposals = {}
         self._forge.close()
 
 

@@ -23,9 +23,9 @@ from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand
 from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.forge import PullRequest
-from demandops.repo.history import commit_log
+from demandops.repo.history import commit_message
 from demandops.repo.write.journal import ProposalRecord
-from demandops.serve.queue import Ticket
+from demandops.serve.demands import Ticket
 
 Decided: TypeAlias = list[tuple[Ticket, Decision]]
 Failed: TypeAlias = list[tuple[Ticket, DemandOpsError]]
@@ -229,11 +229,11 @@ def merge_request(title: str, description: str) -> list[str]:
 
 
 def _head(message: str) -> str:
-    trailers = commit_log.parse(message).trailers
-    reasons = ", ".join(trailers.get(commit_log.REQUIRED_BY, ()))
+    trailers = commit_message.parse(message).trailers
+    reasons = ", ".join(trailers.get(commit_message.REQUIRED_BY, ()))
     changed = "".join(
         f"This has changed: it replaces {old}, and no approval of that counts here. "
-        for old in trailers.get(commit_log.REPLACES, ())
+        for old in trailers.get(commit_message.REPLACES, ())
     )
     why = code(reasons) if reasons else "an access policy"
     return f"{changed}This demand needs approval, as required by {why}."

@@ -19,19 +19,247 @@ journals what has arrived. The worker's thread makes all other changes of state.
 from __future__ import annotations
 
 import logging
-from collections import Counter, deque
-from collections.abc import Collection, Iterable
-from dataclasses import replace
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from typing import Literal
 
 from demandops.base import errors
-from demandops.base.errors import DemandOpsError, QueueFull, ShuttingDown, StateRepoError, Unsound
+from demandops.base.errors import (
+    DemandOpsError,
+    InvalidInput,
+    QueueFull,
+    ShuttingDown,
+    StateRepoError,
+    Unsound,
+)
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
-from demandops.repo.write.journal import Journal, ProposalRecord
-from demandops.serve import queue
-from demandops.serve.queue import Receipt, State, Ticket, ticket_from_journal
+from demandops.cluster.health import Target
+from demandops.decide.decision import Outcome
+from demandops.model.demand.demand import Demand
+from demandops.model.demand.goals import read_journaled
+from demandops.model.ledger.ledger import ClaimChange
+from demandops.repo.write.journal import Journal, ProposalRecord, Record
+
+# ---- a demand under way, from its submission to its receipt ----
 
 log = logging.getLogger("demandops")
+
+# What a demand's listener is told.
+Stage = Literal[
+    "away",  # the state repo cannot be reached or written now
+    "admitted",  # the demand is valid
+    "booked",  # its claims are computed, but not committed yet
+    "waiting",  # no node has room for it, so it will be booked later
+    "committed",  # it has a commit
+    "proposed",  # it awaits a person's approval
+    "pushed",  # the commit in its receipt is published
+    # Its answer is an error. Not told if the demand was not accepted, was taken back by its client,
+    # or stays in the journal.
+    "refused",
+]
+Listener = Callable[[Stage, str], None]
+
+# Only :class:`Demands` changes the state of a demand.
+State = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done"]
+
+
+@dataclass(frozen=True, slots=True)
+class Receipt:
+    # of a demand whose commit is published and durable; if an earlier attempt or run published it,
+    # only the first four fields are known
+    operation: str
+    request_id: str
+    outcome: Outcome
+    commit: str  # of a demand that changed nothing, the newest one on which it was decided
+    warnings: tuple[str, ...] = ()
+    not_held: tuple[str, ...] = ()
+    placed: tuple[str, ...] = ()  # which nodes the generator chose, and why
+    lease_s: int | None = None
+    targets: tuple[Target, ...] = ()  # the releases to follow, if the generator was asked for them
+    changes: tuple[ClaimChange, ...] = ()
+
+
+@dataclass(eq=False)
+class Ticket:
+    operation: str
+    demand: Demand
+    received: datetime
+    listener: Listener = lambda stage, text: None
+    future: Future[Receipt] = field(default_factory=Future)
+    # True once a crash cannot lose the demand; false if it was refused without being journaled.
+    journaled: Future[bool] = field(default_factory=Future)
+    # A tip that does not include the demand; only later commits may record the demand.
+    base: str = ""
+    # Whether the remote may have accepted a push of the demand although no answer arrived.
+    maybe_published: bool = False
+    # Whether this demand released one that awaited approval: then it succeeds even if it ends no
+    # claim.
+    has_released: bool = False
+    state: State = "queued"
+    # while it is in the queue: its place in the order of arrival, and what it touches (None: any)
+    number: int = 0
+    subjects: frozenset[Hashable] | None = None
+    notified: set[str] = field(default_factory=set)
+    proposal: ProposalRecord | None = None
+
+    def __post_init__(self) -> None:
+        for future in (self.future, self.journaled):
+            future.set_running_or_notify_cancel()  # a demand is withdrawn, not canceled
+
+    @property
+    def requester(self) -> str:  # the first; empty if there is none
+        return next(iter(self.demand.requesters()), "")
+
+    def refuse(self, error: DemandOpsError) -> None:
+        # only a demand that is not in the journal yet
+        self.state = "done"
+        self.future.set_exception(error)
+        self.journaled.set_result(False)
+
+    def notify(self, stage: Stage, text: str) -> None:
+        # A stage is reported once, although a demand is evaluated again after each lost race. But a
+        # proposal has another text once its pull request is known.
+        key = text if stage == "proposed" else stage
+        if key in self.notified:
+            return
+        self.notified.add(key)
+        try:
+            self.listener(stage, text)
+        except Exception:
+            log.exception("a listener failed")
+
+    def mark_maybe_published(self, base: str) -> None:
+        if not self.maybe_published:  # the oldest base counts, because any try may have succeeded
+            self.base, self.maybe_published = base, True
+
+    def record(self, proposal: ProposalRecord | None = None) -> Record:
+        # for the journal
+        return {
+            "operation": self.operation,
+            "goal": self.demand.goal,
+            "received": self.received.isoformat(),
+            "base": self.base,
+            **({"proposal": proposal} if proposal else {}),
+        }
+
+
+def ticket_from_journal(record: Record) -> Ticket:
+    demand = read_journaled(record["goal"])
+    ticket = Ticket(record["operation"], demand, datetime.fromisoformat(record["received"]))
+    name = f"demand {ticket.operation} ({quoted(demand.id)}) from the journal"
+
+    def tell(stage: Stage, text: str) -> None:
+        if stage in ("proposed", "pushed"):
+            log.info("%s: %s", name, text)
+        elif stage == "refused":
+            log.error("%s: refused: %s", name, text)
+
+    ticket.listener = tell
+    ticket.journaled.set_result(True)
+    ticket.mark_maybe_published(record["base"])  # the earlier run may have ended after the push
+    if (proposal := record.get("proposal")) is not None:
+        ticket.proposal = proposal
+        ticket.state = "withdrawn" if proposal.withdrawn else "proposed"
+    return ticket
+
+
+# ---- the queue of demands: requesters take turns, and related demands keep their order ----
+#
+# A demand counts only for its first requester. If another queued demand must stay ahead of the
+# demand whose turn it is, the queue returns the other demand first.
+#
+# - Demands that share an application, a connection or a demand id keep their order.
+# - A rollback or a decommission may touch any subject, so it overtakes no demand, and no demand
+#   overtakes it.
+
+_Line = OrderedDict[Ticket, None]  # a set in order, which loses any member at once
+
+
+class FairQueue:
+    # Not thread-safe. With ``in_order``, demands leave in the order of their arrival, and
+    # requesters take no turns.
+
+    def __init__(self, *, in_order: bool = False) -> None:
+        self._in_order = in_order
+        self._queued = OrderedDict[Ticket, None]()
+        # The lines in which the demands stand: of their requesters, and of what they touch, where
+        # None is the line of those that may touch anything. No line is empty.
+        self._lanes = OrderedDict[Hashable, _Line]()
+        self._subjects: dict[Hashable, _Line] = {}
+        self._arrived = 0
+
+    def __len__(self) -> int:
+        return len(self._queued)
+
+    def append(self, ticket: Ticket) -> None:
+        self._arrived += 1
+        ticket.number, ticket.subjects = self._arrived, ticket.demand.touches()
+        self._queued[ticket] = None
+        for lines, key in self._places(ticket):
+            lines.setdefault(key, OrderedDict())[ticket] = None
+
+    def put_back(self, tickets: Sequence[Ticket], served: Iterable[Ticket] = ()) -> None:
+        # In the order in which they left, each before others of its requester. Their requesters get
+        # the next turns. But a requester of ``served``, demands that left with them and do not come
+        # back, had its turn and comes after all others.
+        number = next(iter(self._queued)).number if self._queued else 1
+        for ticket in reversed(tickets):
+            number -= 1
+            ticket.number = number
+            self._queued[ticket] = None
+            self._queued.move_to_end(ticket, last=False)
+            lane, *subjects = self._places(ticket)
+            for lines, key in (lane, *subjects):
+                lines.setdefault(key, OrderedDict())[ticket] = None
+                lines[key].move_to_end(ticket, last=False)
+            self._lanes.move_to_end(lane[1], last=False)
+        for requester in dict.fromkeys(ticket.requester for ticket in served):
+            if requester in self._lanes:
+                self._lanes.move_to_end(requester)
+
+    def remove(self, tickets: Iterable[Ticket]) -> None:
+        for ticket in tickets:
+            if ticket in self._queued:
+                del self._queued[ticket]
+                for lines, key in self._places(ticket):
+                    del lines[key][ticket]
+                    if not lines[key]:  # many ids come only once; keep none of them
+                        del lines[key]
+
+    def popleft(self) -> Ticket:
+        requester, lane = next(iter(self._lanes.items()))
+        self._lanes.move_to_end(requester)  # so that the other requesters come first
+        first = next(iter(lane))
+        # whoever has the turn, related demands leave in the order in which they came
+        while (predecessor := self._predecessor(first)) is not None:
+            first = predecessor
+        self.remove([first])
+        return first
+
+    def _places(self, ticket: Ticket) -> list[tuple[dict[Hashable, _Line], Hashable]]:
+        subjects = (None,) if ticket.subjects is None else ticket.subjects
+        lane = "" if self._in_order else ticket.requester
+        return [(self._lanes, lane), *((self._subjects, subject) for subject in subjects)]
+
+    def _predecessor(self, ticket: Ticket) -> Ticket | None:
+        if ticket.subjects is None:
+            oldest = next(iter(self._queued))
+            return oldest if oldest is not ticket else None
+        if None in self._subjects:
+            first = next(iter(self._subjects[None]))
+            if first.number < ticket.number:
+                return first
+        for subject in ticket.subjects:
+            if (first := next(iter(self._subjects[subject]))) is not ticket:
+                return first
+        return None
+
+
+# ---- the states of the demands ----
 
 TAKEN_BACK = "the demand was taken back before it was committed"
 
@@ -54,17 +282,17 @@ class Demands:
         self._limit, self._requester_limit = limit, requester_limit
         self._of_requester = Counter[str]()
         self._changed = runtime.condition()
-        resumed = [ticket_from_journal(entry) for entry in journal.pending.values()]
+        resumed = [ticket_from_journal(record) for record in journal.pending.values()]
         self._tickets = {ticket.operation: ticket for ticket in resumed}
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
-        self._queue = queue.FairQueue(in_order=requester_limit is None)
+        self._queue = FairQueue(in_order=requester_limit is None)
         for ticket in resumed:
             if ticket.proposal is None:
                 self._enqueue(ticket)
         self._taken_back: list[Ticket] = []
-        self._closed = self._woken = False
+        self.is_closed = self._woken = False
         # Why no demand can be published now, or empty. QueueFull quotes it: a queue that is full
         # behind a remote that is away needs another remedy than a client that sends too much.
         self.blocked = ""
@@ -86,15 +314,11 @@ class Demands:
     def unpublished(self) -> int:
         """The number of demands still to publish: those in the journal that await no approval."""
         with self._changed:
-            return sum(1 for entry in self._journal.pending.values() if entry.proposal is None)
+            return sum(1 for each in self._journal.pending.values() if "proposal" not in each)
 
     @property
     def has_queued(self) -> bool:
         return bool(self._arrived or self._queue)
-
-    @property
-    def must_not_wait(self) -> bool:
-        return self.has_queued or self._closed
 
     # ---- waiting for demands ----
 
@@ -102,7 +326,7 @@ class Demands:
         """Accept no further demands; the demands that have arrived are still carried out."""
         self._take_in()  # what came before is accepted
         with self._changed:
-            self._closed = True
+            self.is_closed = True
             self._changed.notify()
         self._take_in()  # what came between the two is refused; no thread would look at it again
         self._arrival.set()
@@ -115,22 +339,21 @@ class Demands:
     def wait(self, timeout: float | None) -> bool:
         """Wait for a demand, :meth:`wake` or :meth:`close`; false once no demand will come."""
         with self._changed:
-            self._wait(timeout, self.must_not_wait)
-            return self.has_queued or not self._closed
+            if not (self._woken or self.is_closed or self.has_queued):
+                self._changed.wait(timeout)
+            self._woken = False
+            return self.has_queued or not self.is_closed
 
     def new_demands(self, timeout: float) -> list[Ticket]:
         """Return the demands accepted since this or :meth:`take` was called; wait if none is."""
         with self._changed:
-            self._wait(timeout, bool(self._new))
+            if not (self._woken or self._new):
+                self._changed.wait(timeout)
+            self._woken = False
             # after a failed write the state of the journal is unknown, so the process must end
             self._journal.require_sound()
             new, self._new = self._new, []
             return new
-
-    def _wait(self, timeout: float | None, has_work: bool) -> None:
-        if not has_work and not self._woken:
-            self._changed.wait(timeout)
-        self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
         self._take_in()
@@ -157,12 +380,12 @@ class Demands:
         ticket.state = "arrived"
         self._arrived.append(ticket)
         self._arrival.set()
-        if self._closed:  # that thread may have ended, so refuse the demand here
+        if self.is_closed:  # that thread may have ended, so refuse the demand here
             self._take_in()
 
     def journal_arrivals(self) -> None:
         # demands that arrive during an fsync of the journal share the next fsync
-        while not self._closed:
+        while not self.is_closed:
             self._arrival.wait()
             self._arrival.clear()
             self._take_in()
@@ -181,7 +404,7 @@ class Demands:
                 self._tickets[ticket.operation] = ticket
                 taken.append(ticket)
             try:
-                self._journal.append(ticket.journal_entry() for ticket in taken)
+                self._journal.append(ticket.record() for ticket in taken)
             except Exception as failure:
                 if isinstance(failure, DemandOpsError):
                     why = failure
@@ -206,7 +429,7 @@ class Demands:
             ticket.refuse(error)
 
     def _why_refused(self, ticket: Ticket, others: int) -> DemandOpsError | None:
-        if self._closed:
+        if self.is_closed:
             return ShuttingDown("the generator is shutting down; send the demand again later")
         # the others were accepted just before, and are not queued yet
         if others + len(self._queue) >= self._limit:
@@ -233,9 +456,9 @@ class Demands:
     def propose(self, ticket: Ticket, record: ProposalRecord) -> bool:
         """Journal the proposal of a demand; false if it is withdrawn or answered already."""
         with self._changed:
-            if not _may_become(ticket, "proposed"):
+            if "proposed" not in _NEXT[ticket.state]:
                 return False
-            self._journal.append([ticket.journal_entry(record)])
+            self._journal.append([ticket.record(record)])
             self._leave(ticket)
             ticket.proposal = record
             return _change(ticket, "proposed")
@@ -244,7 +467,7 @@ class Demands:
         with self._changed:
             for ticket in tickets:
                 ticket.mark_maybe_published(ticket.base)  # a person may have merged it meanwhile
-                self._journal.append([ticket.journal_entry()])
+                self._journal.append([ticket.record()])
                 ticket.proposal = None
                 _change(ticket, "queued")
                 self._enqueue(ticket)
@@ -254,7 +477,7 @@ class Demands:
         self._take_in()
         with self._changed:
             ticket = self._tickets.get(operation)
-            if ticket is None or not _may_become(ticket, "withdrawn"):
+            if ticket is None or "withdrawn" not in _NEXT[ticket.state]:
                 return ticket is not None and ticket.state == "withdrawn"
             try:
                 self._withdraw(ticket, TAKEN_BACK)
@@ -277,7 +500,7 @@ class Demands:
             self._taken_back.append(ticket)
         else:  # the demand stays in the journal until its branch is deleted
             record = replace(ticket.proposal, withdrawn=reason)
-            self._journal.append([ticket.journal_entry(record)])
+            self._journal.append([ticket.record(record)])
             ticket.proposal = record
         _change(ticket, "withdrawn")
         self.wake()  # the worker answers the demand even while nothing can be published
@@ -303,7 +526,8 @@ class Demands:
             if isinstance(result, Receipt) or ticket.state == "done":
                 continue
             if str(result) != TAKEN_BACK:  # a client that took its demand back needs no notice
-                ticket.notify("refused", queue.reason_of(result))
+                text = result.text_with_codes() if isinstance(result, InvalidInput) else str(result)
+                ticket.notify("refused", text)
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
             if not keep:
@@ -356,11 +580,7 @@ class Demands:
             self._of_requester -= Counter([ticket.requester])
 
 
-def _may_become(ticket: Ticket, state: State) -> bool:
-    return state in _NEXT[ticket.state]
-
-
 def _change(ticket: Ticket, state: State) -> bool:
-    if _may_become(ticket, state):
+    if state in _NEXT[ticket.state]:
         ticket.state = state
     return ticket.state == state

@@ -6,6 +6,7 @@ import logging
 from dataclasses import replace
 from datetime import timedelta
 from itertools import count
+from math import inf
 
 import pytest
 from demandops.base.runtime import REAL
@@ -15,20 +16,20 @@ from demandops.model.config.load import load
 from demandops.model.demand.demand import Application, Demand, Item, Lease
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
-from demandops.serve.timing.expiry import LeaseExpiry
-from demandops.serve.timing.pauses_and_limits import (
+from demandops.serve.agenda import (
     FIRST_PAUSE_S,
     LONGEST_AWAY_S,
     LONGEST_TURN_S,
+    Agenda,
     Backoff,
-    PollTimer,
+    LeaseExpiry,
     RateLimit,
     parse_interval,
 )
 from demandops.serve.worker import RemoteMonitor
 
 from tests.kit.clock import Clock
-from tests.kit.config import configuration, edited
+from tests.kit.config import configuration, edited, state_of
 from tests.kit.memory import NOW, rebuilt
 
 
@@ -50,7 +51,7 @@ def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew()
     assert pace.unreachable() <= FIRST_PAUSE_S
     for _ in range(10):
         pace.overtaken(10, 0.1, 1.0)
-    pace.published()
+    pace.begin_anew()
     assert pace.overtaken(10, 0.1, 1.0) <= FIRST_PAUSE_S
 
 
@@ -60,8 +61,11 @@ def test_a_batch_takes_no_more_demands_than_are_evaluated_during_one_push() -> N
     for demands, evaluating_s, most in ((100, 0.1, 100), (100, 1.0, 20), (2, 100.0, 1), (1, 0, 1)):
         pace.overtaken(demands, evaluating_s=evaluating_s, pushing_s=0.2)
         assert pace.max_demands == most
-    pace.published()
+    pace.begin_anew()
     assert pace.max_demands == 200
+
+
+EMPTY = state_of(load(configuration()))
 
 
 @pytest.fixture
@@ -69,13 +73,17 @@ def clock() -> Clock:
     return Clock(NOW)
 
 
+def fetch_in(agenda: Agenda) -> float:
+    return agenda.seconds_until_due(EMPTY, "")["fetch"]
+
+
 def test_the_first_look_is_due_at_once_and_the_next_after_the_interval(clock: Clock) -> None:
-    made = PollTimer(30, clock)
-    assert made.start_if_due()
-    made.finished(reached=True)
-    assert made.seconds_until_due() == 30 and not made.start_if_due()
+    made = Agenda(30, clock)
+    assert fetch_in(made) == 0
+    made.fetched(reached=True)
+    assert fetch_in(made) == 30
     clock.pass_(30)
-    assert made.start_if_due()
+    assert fetch_in(made) == 0
 
 
 @pytest.mark.parametrize(
@@ -84,43 +92,45 @@ def test_the_first_look_is_due_at_once_and_the_next_after_the_interval(clock: Cl
         (10, False, [False] * 5 + [True], [20, 40, 60, 60, 60, 10]),
         (600, False, [False, True], [600, 600]),  # above the bound
         (30, True, [True], [1]),  # on this disk a look costs little
-        (0, True, [True], [None]),
+        (0, True, [True], [inf]),
     ],
 )
 def test_while_the_remote_is_away_looks_become_seldom_within_bounds(
-    clock: Clock, interval: float, is_local: bool, reached: list[bool], pauses: list[float | None]
+    clock: Clock, interval: float, is_local: bool, reached: list[bool], pauses: list[float]
 ) -> None:
-    made, found = PollTimer(interval, clock, local=is_local), []
+    made, found = Agenda(interval, clock, local=is_local), []
     for is_reached in reached:
-        made.finished(reached=is_reached)
-        found.append(made.seconds_until_due())
+        made.fetched(reached=is_reached)
+        found.append(fetch_in(made))
     assert found == pauses
 
 
 def test_many_requests_give_one_poll_and_one_more_after_it(clock: Clock) -> None:
-    made = PollTimer(0, clock)
-    assert made.seconds_until_due() is None and not made.start_if_due()
+    made = Agenda(0, clock)
+    assert fetch_in(made) == inf
     for _ in range(3):
-        made.request()
-    assert made.start_if_due()
-    assert not made.start_if_due()
-    made.request()  # this comes during the poll, which may have missed the cause of the request
-    made.finished(reached=True)
-    assert made.seconds_until_due() == 0.5, "a burst of requests must not give one poll each"
+        made.request_fetch()
+    assert fetch_in(made) == 0
+    made.fetch_begins()
+    assert fetch_in(made) == inf
+    made.request_fetch()  # this comes during the poll, which may have missed its cause
+    made.fetched(reached=True)
+    assert fetch_in(made) == 0.5, "a burst of requests must not give one poll each"
     clock.pass_(0.5)
-    assert made.start_if_due()
-    made.finished(reached=True)
-    assert made.seconds_until_due() is None
+    assert fetch_in(made) == 0
+    made.fetch_begins()
+    made.fetched(reached=True)
+    assert fetch_in(made) == inf
 
 
 def test_by_chance_looks_come_earlier_and_never_later() -> None:
-    made = PollTimer(100, REAL)
+    made = Agenda(100, REAL)
     pauses = set()
     for _ in range(50):
-        made.finished(reached=True)
-        pauses.add(made.seconds_until_due())
+        made.fetched(reached=True)
+        pauses.add(fetch_in(made))
     assert len(pauses) > 10
-    assert all(pause is not None and 80 <= pause <= 100 for pause in pauses)
+    assert all(79 < pause <= 100 for pause in pauses)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,169 @@
+"""What follows from people's changes: of claims in the ledger, and of overrides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from datetime import datetime
+from itertools import chain
+
+from demandops.base.errors import Fault, Refused
+from demandops.base.naming import Subject
+from demandops.decide import changeset, rollback
+from demandops.decide.admission import admission, permission
+from demandops.decide.changeset import Changeset, FileReader
+from demandops.decide.checks import collisions, quotas
+from demandops.decide.placement import capacity
+from demandops.decide.placement.capacity import NoRoom
+from demandops.decide.placement.relocation import LedgerUpdate, following_overrides
+from demandops.decide.planning import overrides
+from demandops.decide.planning.release_keys import affected_keys, keys_of_claims
+from demandops.decide.state import State
+from demandops.model.config.override import Override, format_time
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
+from demandops.model.ledger.claim import ClaimKey
+from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, changes_on
+
+# ---- claims that a person edits: what changes with them, and what is wrong with them ----
+
+
+def changeset_of_edit(
+    state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
+) -> Changeset:
+    old = replace(state, ledger=before)
+    keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
+    planned = changeset.plan_change(old, state, Changes(), keys, read)
+    # a template that takes too long is no fault of the claim, so its release keeps its file
+    return changeset.render_change(planned, state.config, state.evaluate, read, keeps_late=True)
+
+
+def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
+    """Yield the faults of claims that a person wrote, each located in the claim's file."""
+    for change in changes:
+        claim = change.after
+        if claim is None:
+            continue
+        # an edit that only takes requesters away has the effect of a release, which is allowed
+        if (
+            (old := change.before)
+            and replace(claim, requesters=old.requesters) == old
+            and {*claim.requesters} <= {*old.requesters}
+        ):
+            continue
+        wanted, config = rollback.request_for(claim), after.config
+        malformed = list(admission.faults(wanted, config))
+        allowed = chain(
+            permission.faults(wanted, config),
+            quotas.quota_faults(before, after, Changes((change,))),
+        )
+        for each in malformed or allowed:
+            yield each.within(claim_files.path_of(claim.key))
+        yield from collisions.faults_of_claim(claim, before, after)
+        keys, changed = keys_of_claims(after, [claim]), Changes((change,))
+        faults = list(collisions.name_faults(wanted, before, after, keys, changed, after.names()))
+        without = replace(after, ledger=after.ledger.replace(change.key, change.before))
+        with suppress(Refused):  # other checks report a claim that cannot be planned
+            grown = capacity.growth_by(without, after, [change])
+            # only growth is a fault: the nodes may be full because of other claims
+            usage = after.usage().plus({need: -amount for need, amount in grown.items()})
+            faults += NoRoom(usage, grown, config).faults
+        for each in faults:
+            yield each.within(claim_files.path_of(claim.key))
+
+
+# ---- changes to the ledger when overrides change or end: kept claims, moved services, markers ----
+#
+# A marker is a file of the ledger that records that an override has ended. When an override in
+# effect reaches its end, the generator publishes a commit with the marker. Until then the override
+# stays in effect, so what runs depends on files alone and not on a clock.
+
+
+def update_ledger(
+    before: World,
+    after: World,
+    subjects: Iterable[Subject],
+    markers: Mapping[str, str],
+    now: datetime,
+) -> LedgerUpdate:
+    """Return the ledger that a change of the configuration requires, and the files to write.
+
+    ``subjects`` are those whose claims a person changed. ``markers`` are the ledger's markers of
+    ended overrides, by path.
+    """
+    # An override that is merged after its end never applies. One that was in effect before stays
+    # in effect until the generator's own commit ends it.
+    in_effect = {override.name: override.end for override in before.overrides}
+    expired = [
+        override
+        for override in expired_overrides(after, now)
+        if override.name not in in_effect or in_effect[override.name] != override.end
+    ]
+    stale = records.stale_markers(markers, after.config.overrides)
+    ended = {
+        name: end
+        for name, end in after.ledger.ended.items()
+        if records.ended_override_path(name) not in stale
+    }
+    ended |= {each.name: format_time(each.end) for each in expired if each.end}
+    files: dict[str, str | None] = dict.fromkeys(stale)
+    for override in expired:
+        files |= _marker(override)
+    after = replace(after, ledger=replace(after.ledger, ended=ended))
+    kept = (*overrides.kept_subjects(before.ledger), *overrides.kept_subjects(after.ledger))
+    update = update_claims(before.ledger, after, dict.fromkeys((*subjects, *kept)), now)
+    moved = following_overrides(replace(after, ledger=update.ledger))
+    keys = (*update.keys, *moved.keys)
+    files |= changed_claim_files(after.ledger, moved.ledger, keys)
+    return replace(moved, keys=keys, files=files)
+
+
+def update_claims(
+    before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
+) -> LedgerUpdate:
+    subjects = tuple(subjects)
+    ledger, kept = overrides.update_kept_claims(before, after, subjects, now)
+    moved = following_overrides(replace(after, ledger=ledger), subjects)
+    keys = (*kept, *moved.keys)
+    files = changed_claim_files(after.ledger, moved.ledger, keys)
+    return replace(moved, keys=keys, files=files)
+
+
+def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
+    if override.end is None:
+        raise ValueError(f"{override.path} has no end")
+    ended = {**world.ledger.ended, override.name: format_time(override.end)}
+    after = replace(world, ledger=replace(world.ledger, ended=ended))
+    update = update_ledger(world, after, (), {}, now)
+    return replace(update, files={**update.files, **_marker(override)})
+
+
+def _marker(override: Override) -> dict[str, str]:
+    return {records.ended_override_path(override.name): records.ended_override_text(override)}
+
+
+def changed_claim_files(
+    before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
+) -> dict[str, str | None]:
+    """Return the new texts of the files of changed claims, by path; ``None`` removes a file."""
+    files: dict[str, str | None] = {}
+    for key in keys:
+        claim = after.get(key)
+        if claim != before.get(key):
+            files[claim_files.path_of(key)] = claim_files.text_of(claim) if claim else None
+    return files
+
+
+def expired_overrides(world: World, now: datetime) -> list[Override]:
+    """Return the overrides in effect although their end has passed, sorted by end."""
+    ends = [(each.end, each.name, each) for each in world.overrides if each.end]
+    expired = [each for each in ends if each[0] <= now]
+    return [override for _, _, override in sorted(expired, key=lambda each: each[:2])]
+
+
+def changed_override_files(before: World, after: World) -> list[str]:
+    old = {override.name: override for override in before.overrides}
+    new = {override.name: override for override in after.overrides}
+    names = [name for name in {*old, *new} if old.get(name) != new.get(name)]
+    return sorted((new.get(name) or old[name]).path for name in names)

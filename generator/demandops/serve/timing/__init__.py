@@ -1,1 +1,0 @@
-"""What the worker does when nobody demands anything, and when."""
