@@ -48,7 +48,10 @@ def book(on: On) -> Book:
     """Return a function that books a connection with ``demandops request``."""
 
     def call(id: str, key: str | Path = "") -> Ran:
-        return on.book(goal([], [connection(id)]), more=("--signing-key", key) if key else ())
+        return on.book(
+            goal([], [connection(id, topics=[f"/t{sum(map(ord, id))}"])]),
+            more=("--signing-key", key) if key else (),
+        )
 
     return call
 
@@ -225,7 +228,7 @@ def test_a_key_that_is_gone_later_is_told_to_the_requester(
     state: GitRepo, key: Path, tmp_path: Path
 ) -> None:
     def submit(generator: Generator, id: str) -> None:
-        rig.receipt(generator.submit(goal([], [connection(id)])))
+        rig.receipt(generator.submit(goal([], [connection(id, topics=[f"/t{sum(map(ord, id))}"])])))
 
     with rig.running(state.path, signing_key=key) as generator:
         submit(generator, "a")
