@@ -86,8 +86,7 @@ def of_lidars(books: MemoryRepo) -> dict[str, Any]:
 def test_object_detection_reads_the_driver_that_lane_detection_has(books: MemoryRepo) -> None:
     books.send(DEMAND)
     before = of_lidars(books)
-    brought = connection(topics=["/vehicle00_points"])
-    join = goal([application("edge/fusion", who=["operator"], clouds=[CLOUD])], [brought])
+    join = goal([application("edge/fusion", who=["operator"], clouds=[CLOUD])])
     assert books.send(join).warnings == ()
     assert of_lidars(books).keys() == before.keys()
     shared = of_lidars(books)["lidar-vehicle00-vehicle00"]

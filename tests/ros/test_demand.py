@@ -41,7 +41,11 @@ RECORDER: dict[str, Any] = {
 
 
 def link(id: str) -> dict[str, Any]:
-    topics = [{"source": "/a", "qos": 1, "reverse": True}, {"source": "/b", "target": "/c"}]
+    # of its own, because one connection carries a topic for all who demand it
+    topics = [
+        {"source": f"/{id}/a", "qos": 1, "reverse": True},
+        {"source": f"/{id}/b", "target": f"/{id}/c"},
+    ]
     return {"id": id, "source": "vehicle00", "target": "edge", "topics": topics}
 
 
@@ -111,7 +115,7 @@ def test_a_refusal_has_a_code_and_what_cannot_be_sent_is_a_value_error(
         vehicle.put("refused \ud800")
     assert vehicle.put("refused", connections=[link("refused")]).outcome == "booked"
     topics = shared.bookkeeping()["connections"]["refused"]["topics"]
-    assert topics == {"/a": ["vehicle00"], "/b": ["vehicle00"]}
+    assert topics == {"/refused/a": ["vehicle00"], "/refused/b": ["vehicle00"]}
 
 
 def test_services_run_where_the_message_says(shared: Served, vehicle: DemandClient) -> None:

@@ -251,7 +251,6 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
 def test_bookkeeping_that_cannot_be_read_is_told_and_is_not_used(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(logging.getLogger("demandops"), "propagate", True)
     file = read(rules_of(), "rules.yaml")
     odd = ["", "null", "[]", "{", "[" * 100_000, '{"demands": []}', '{"demands": {"a": 1}}']
     assert [read_bookkeeping(text, file) for text in odd] == [None] * len(odd)

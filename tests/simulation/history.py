@@ -161,7 +161,8 @@ class History:
         puts = [one for one in known if one["operation"] == "put"]
         if puts and self.chance.randrange(3):  # mostly the same demand again
             (app,) = puts[-1]["applications"]
-            return puts[-1] | {"applications": [app | {"inputs": inputs}]}
+            again = app | {"inputs": inputs, "node": self.chance.choice([app["node"], HALL])}
+            return puts[-1] | {"applications": [again]}
         number, names = self.chance.randrange(3), ["traffic", "vehicle01", "vehicle01", "vehicle00"]
         who = [["vehicle01"], ["vehicle01"], ["traffic", "vehicle01"]][number]
         if not self.chance.randrange(3):  # others, who may change nothing of these

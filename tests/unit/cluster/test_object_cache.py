@@ -208,7 +208,6 @@ def test_data_of_a_deleted_config_map_stay_valid(
             return Answer.json({"reason": "over"}, 503)
         return Answer.json({"metadata": {"resourceVersion": "1"}, "items": items.pop(0)})
 
-    monkeypatch.setattr(logging.getLogger("demandops"), "propagate", True)
     with serving(answer) as server:
         config = kubeconfig(tmp_path, server.url)
         watch = ConfigMapWatch(
