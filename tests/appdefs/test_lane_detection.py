@@ -14,7 +14,7 @@ import yaml
 from demandops.model.demand.demand import Application
 
 from tests.kit.config import skeleton
-from tests.kit.goals import CLOUD, application, connection, goal
+from tests.kit.goals import CLOUD, application, goal
 from tests.kit.memory import MemoryRepo, rebuilt
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "lane-detection"
