@@ -32,6 +32,7 @@ from demandops.decide.checks.version_difference import Difference
 from demandops.decide.placement import capacity, placement, relocation
 from demandops.decide.placement.candidates import NO_ROOM
 from demandops.decide.placement.capacity import Need
+from demandops.decide.planning import chains
 from demandops.decide.planning.flows import flows_without_carrier
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.release_keys import affected_keys
@@ -330,9 +331,11 @@ def _booked(
         ledger = ledger.without(ledger.kept_claims(subject))
     ledger, changes = apply(ledger, request, now)
     if not isinstance(request, Restoration):
-        ledger, idle = carriers.without_idle_routes(ledger, state.config, changes.claims)
-        idle += [change.key for change in changes.claims]
-        changes = replace(changes, claims=claim_changes(state.ledger, ledger, idle))
+        ledger, idle = chains.without_idle_holds(ledger, changes.claims)
+        ends = [*idle, *(change.key for change in changes.claims)]
+        ended = claim_changes(state.ledger, ledger, ends)
+        ledger, routes = carriers.without_idle_routes(ledger, state.config, ended)
+        changes = replace(changes, claims=claim_changes(state.ledger, ledger, [*routes, *ends]))
     after = replace(state, ledger=ledger)
     checkpoint()
     refusals = list(quotas.denial_faults(request, after, changes))

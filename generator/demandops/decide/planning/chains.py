@@ -7,7 +7,7 @@ like any other, marked with who reads it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import reduce
 from graphlib import CycleError, TopologicalSorter
@@ -20,7 +20,7 @@ from demandops.decide.planning.flows import topics_of_origin, with_further_topic
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import AnyDemand, Application, Demand, InputTopic, Item
 from demandops.model.ledger.claim import ClaimKey
-from demandops.model.ledger.ledger import Ledger
+from demandops.model.ledger.ledger import ClaimChange, Ledger
 
 
 class _Problem(NamedTuple):
@@ -181,6 +181,33 @@ def with_held_applications(request: AnyDemand, ledger: Ledger, config: Config) -
                 reading.append(held[id])
     more = (replace(i, held=replace(app, held_for=readers[app.id])) for i, app in held.values())
     return replace(request, demanded=(*request.demanded, *more))
+
+
+def without_idle_holds(
+    ledger: Ledger, changes: Iterable[ClaimChange]
+) -> tuple[Ledger, list[ClaimKey]]:
+    """Return the ledger in which the changed demands hold applications only for readers they have.
+
+    A decommission, and a lease that ends in one access domain, may take the reader alone.
+    """
+    keys = list[ClaimKey]()
+    for demand in dict.fromkeys(change.key.demand for change in changes if change.before):
+        while idle := [  # again, because what was held may have held more
+            (claim, readers)
+            for claim in ledger.claims_of_demand(demand)
+            if claim.is_on_application and (held_for := claim.application.held_for)
+            for readers in [{id: held_for[id] for id in held_for if _has(ledger, demand, id)}]
+            if readers != held_for
+        ]:
+            for claim, readers in idle:
+                left = replace(claim, held=replace(claim.application, held_for=readers))
+                ledger = ledger.replace(claim.key, left if readers else None)
+                keys.append(claim.key)
+    return ledger, keys
+
+
+def _has(ledger: Ledger, demand: str, application: str) -> bool:
+    return ledger.get(ClaimKey(Subject(SubjectKind.APPLICATION, application), demand)) is not None
 
 
 def followed(app: Application, demand: str, ledger: Ledger, config: Config) -> Application:

@@ -208,6 +208,8 @@ def _kept_claim(
     if not keeping or suspended_by(last, world) is not None:
         return None
     name, who = OVERRIDE_PREFIX + keeping[0].name, (keeping[0].owner,)
+    if last.is_on_application:  # what it was held for does not matter any longer
+        last = replace(last, held=replace(last.application, held_for={}))
     last = replace(last, demand=name, request=name, requesters=who, booked=now)
     return replace(last, lease=None, joined=False)
 
