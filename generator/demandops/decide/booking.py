@@ -348,6 +348,10 @@ def renew_leases(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger
 def expire(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
     held = ledger.claims_of_demand(request.demand)
     ended = [claim for claim in held if claim.lease and claim.lease.has_ended(now)]
+    readers = [each for each in held if each.is_on_application and each.application.read_outputs]
+    for claim in ended:  # what reads it ends with it, and may be read itself
+        read = claim.subject.id if claim.is_on_application else ""
+        ended += [c for c in readers if read in c.application.read_outputs and c not in ended]
     after = ledger.without(ended)
     return after, Changes(claims=claim_changes(ledger, after, [claim.key for claim in ended]))
 
