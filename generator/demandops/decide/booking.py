@@ -390,7 +390,7 @@ def decommission(ledger: Ledger, request: Decommission) -> tuple[Ledger, Changes
 
 
 def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
-    subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.applications_at(node)]
+    subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.ids_with("node", node)]
     subjects += [Subject(SubjectKind.CONNECTION, id) for id in ledger.connections_needing(node)]
     return [
         claim
