@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timezone
+from datetime import datetime
 from operator import attrgetter
 from typing import Literal, TypeAlias
 
@@ -17,7 +17,7 @@ from demandops.connections.connection import Connection
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override, by_rank, format_time
 from demandops.model.demand.demand import UNSTARTED, Application, InputTopic
-from demandops.model.ledger.claim import Claim, ClaimKey
+from demandops.model.ledger.claim import Claim, ClaimKey, minute_of
 from demandops.model.ledger.records import WaitingDemands
 
 # ---- the ledger: which demand holds which subject, as a set of persistent maps ----
@@ -148,7 +148,8 @@ class Ledger:
         # (input, version of a separate instance), for inputs that topic names show as `part`
         for claim in self.claims_with("further", part):
             app = claim.application
-            yield from ((topic, app.own_version) for topic in app.further_inputs(role, part))
+            further = app.further_by_part.get((role, part), ())
+            yield from ((topic, app.own_version) for topic in further)
 
     def claims_of_demand(self, demand: str) -> tuple[Claim, ...]:
         return self.claims_with("demand", demand)
@@ -208,7 +209,7 @@ class Ledger:
         place = bisect_left(held, key.demand, key=_DEMAND)
         held = held[:place] + ((claim,) if claim else ()) + held[place + (old is not None) :]
         claims = self.claims.insert(key.subject, held) if held else self.claims.remove(key.subject)
-        before, after = index_entries(old), index_entries(claim)
+        before, after = ({*each.index_entries()} if each else set[Entry]() for each in (old, claim))
         index, minutes = self.index, self.minutes
         for entry in before - after:
             others = index[entry].remove(key)
@@ -259,18 +260,6 @@ def ledger_of(claims: Iterable[Claim]) -> Ledger:
     for claim in claims:
         ledger = ledger.replace(claim.key, claim)
     return ledger
-
-
-def minute_of(moment: datetime) -> str:
-    # in UTC, and sorts like the time
-    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
-
-
-def index_entries(claim: Claim | None) -> set[Entry]:
-    entries = set(claim.index_entries()) if claim else set()
-    if claim and claim.lease:
-        entries.add(("ends", minute_of(claim.lease.expires_at)))
-    return entries
 
 
 # ---- what a request changes in the ledger: claims, and other records ----
