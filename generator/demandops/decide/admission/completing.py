@@ -100,17 +100,17 @@ def with_definitions(demand: AnyDemand, config: Config) -> AnyDemand:
     def defined(held: Held) -> Held:
         if not isinstance(held, Application) or not held.appdef.startswith("#"):
             return held
-        wires = ((appdef.name, appdef.deployment_request) for appdef in config.appdefs.values())
-        numbered = ((name, wire) for name, wire in wires if wire and f"#{wire.type}" == held.appdef)
-        appdef, wire = next(numbered, ("", None))
-        if wire is None:
+        number = held.appdef.removeprefix("#")
+        appdef = config.appdef_by_wire_type(int(number)) if number.isdecimal() else None
+        if appdef is None:
             return held
-        roles = {str(name): role for name, role in wire.inputs.items()}
+        wire = appdef.deployment_request
+        roles = {str(name): role for name, role in wire.inputs.items()} if wire else {}
         inputs: dict[str, tuple[InputTopic, ...]] = {}
         for name, topics in held.inputs.items():  # the definition may give both lists to one role
             role = roles.get(name) or name
             inputs[role] = (*inputs.get(role, ()), *topics)
-        return replace(held, appdef=appdef, inputs=inputs)
+        return replace(held, appdef=appdef.name, inputs=inputs)
 
     demanded = tuple(replace(item, held=defined(item.held)) for item in demand.demanded)
     return replace(demand, demanded=demanded)

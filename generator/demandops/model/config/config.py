@@ -201,6 +201,12 @@ class Config:
             raise Refused.at("node", message, code="unknown-node", file=file)
         return node, domain
 
+    def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
+        for appdef in self.appdefs.values():
+            if appdef.deployment_request and appdef.deployment_request.type == number:
+                return appdef
+        return None
+
     def versions_file(self, appdef: str) -> str:
         if appdef in self.versions:
             return self.file_of(VERSIONS_FILE, appdef)
