@@ -305,7 +305,7 @@ def push_on_any_tip(publish: Any, made: Any, expected: Any, commit: Any) -> Any:
 
 @wrong(0, CommitBatch, "commit_files")
 def put_a_commit_on_the_wrong_parent(commit_files: Any, batch: Any, *given: Any) -> Any:
-    batch.head = batch.head.with_commit(batch.start.commit, batch.head.state)
+    batch.head = replace(batch.head, commit=batch.start.commit)
     return commit_files(batch, *given)
 
 

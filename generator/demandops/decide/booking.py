@@ -18,7 +18,6 @@ from demandops.model.demand.demand import (
     Item,
     Operation,
     Term,
-    renewed,
 )
 from demandops.model.ledger.claim import Claim, ClaimKey, demand_id, requesters_of
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
@@ -144,13 +143,16 @@ def book(
     joined: bool = False,
 ) -> Ledger:
     """Book an item; ``current`` is the demand's claim on the same subject so far."""
+    lease = item.term.lease_from(now) if item.term else None
+    if item.term and current and current.lease:
+        lease = current.lease.renewed(item.term, now)
     claim = Claim(
         held=item.held.booked(),
         demand=key.demand,
         request=request,
         requesters=tuple(sorted(set(item.requesters))),
         booked=now,
-        lease=renewed(current.lease if current else None, item.term, now),
+        lease=lease,
         joined=joined,
     )
     if joined and current:
@@ -394,7 +396,7 @@ def decommission(ledger: Ledger, request: Decommission) -> tuple[Ledger, Changes
 
 
 def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
-    subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.applications_at(node)]
+    subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.ids_with("node", node)]
     subjects += [Subject(SubjectKind.CONNECTION, id) for id in ledger.connections_needing(node)]
     return [
         claim

@@ -102,8 +102,8 @@ class _StandingRoutes:
         """
         is_join = request.operation == "join"
         same = RouteKey(flow.sender, flow.topic, flow.receiver, flow.target)
-        bringing = self._ledger.bringing(flow.receiver, flow.target)
-        exact = sorted(self._ledger.route_holders(same), key=_order)[:1]
+        bringing = self._ledger.keys_with("brings", flow.receiver, flow.target)
+        exact = sorted(self._ledger.keys_with("route", *same), key=_order)[:1]
         # thousands of claims may bring a topic, mostly by this very route
         others = bringing if not exact else ()
         for holders in ([each for each in bringing if each.demand == demand], exact, others):
@@ -224,7 +224,7 @@ class _Carriers:
         self._routes.setdefault((header, demand), []).append((item, place, booked_route))
 
     def _carried(self, key: RouteKey, demand: str) -> tuple[Connection, Route] | None:
-        holding = self._ledger.route_holders(key)
+        holding = self._ledger.keys_with("route", *key)
         own = [each for each in holding if each.demand == demand]
         if not own and key in self._above:
             return self._above[key]
@@ -308,7 +308,7 @@ def _difference(listed: Connection, carrier: Connection, config: Config) -> str:
 def doubled(connection: Connection, ledger: Ledger) -> Iterator[tuple[int, str]]:
     """Yield (index, id of the other connection) for each route that another one carries too."""
     for index, route in enumerate(connection.topics):
-        holders = ledger.route_holders(connection.key_of(route))
+        holders = ledger.keys_with("route", *connection.key_of(route))
         others = {key.subject.id for key in holders} - {connection.id}
         if others:
             yield index, min(others)
@@ -321,9 +321,9 @@ def brought_twice(connection: Connection, ledger: Ledger) -> Iterator[tuple[int,
     for key in keys:
         own.setdefault(key[2:], []).append(key)
     for index, key in enumerate(keys):
-        holders = ledger.route_holders(key)
+        holders = ledger.keys_with("route", *key)
         rivals = [(other, connection.id) for other in own[key[2:]] if other != key]
-        bringing = ledger.bringing(key.receiver, key.target)
+        bringing = ledger.keys_with("brings", key.receiver, key.target)
         # thousands of claims may bring the topic, and mostly all by this route
         for holder in bringing if len(bringing) > len(holders) and not rivals else ():
             claim = ledger.get(holder) if holder not in holders else None
@@ -413,7 +413,7 @@ def _path(flow: Flow) -> tuple[str, str, str, str]:
 
 
 def carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
-    for claim in ledger.claims_bringing(flow.receiver, flow.target):
+    for claim in ledger.claims_with("brings", flow.receiver, flow.target):
         for route in claim.connection.topics if claim.demand == demand else ():
             key = claim.connection.key_of(route)
             if (key.sender, *key[2:]) == (flow.sender, flow.receiver, flow.target):

@@ -139,7 +139,7 @@ def lost_output_notes(changes: Changes, after: World) -> Iterator[str]:
         ):
             for made in topics_of_origin(after.config, app, output):
                 place = made.node, made.topic.topic
-                reading = [claim.key for claim in after.ledger.each_reading(*place)]
+                reading = [claim.key for claim in after.ledger.each_with("takes", *place)]
                 if reading and not any(publishers(after, *place)):
                     what = f"{made.topic.topic} of '{made.node}' ({output})"
                     lost = dict.fromkeys(reading, what) | lost
@@ -169,10 +169,12 @@ def notes(request: Demand, before: World) -> Iterator[str]:
 
     def earlier(node: str, topic: str) -> Collection[str]:
         # thousands of claims may read from a node, but nearly always one of them names the topic
-        if any(claim.demand != own for claim in before.ledger.each_reading(node, topic)):
+        if any(claim.demand != own for claim in before.ledger.each_with("takes", node, topic)):
             return (topic,)
         if node not in booked:
-            claims = (claim for claim in before.ledger.claims_from(node) if claim.demand != own)
+            claims = (
+                claim for claim in before.ledger.each_with("from", node) if claim.demand != own
+            )
             named = (named for claim in claims for named in _named_topics(claim.held))
             booked[node] = frozenset(topic for sender, topic in named if sender == node)
         return booked[node]

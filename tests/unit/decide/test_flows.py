@@ -379,5 +379,5 @@ def test_every_topic_that_a_service_reads_comes_in_one_way_and_no_other_is_carri
                 assert moved[app["id"]] == wanted(graphs, app, active.values())
         assert_follows(repo, demands, moved)
     configure(repo, plain)
-    assert not repo.state.ledger.moved_applications()
+    assert not repo.state.ledger.ids_with("moved")
     assert_follows(repo, demands, defaultdict(dict))

@@ -54,9 +54,9 @@ def test_a_refusal_suggests_no_claims_of_overrides() -> None:
 
 def test_a_reverse_route_delivers_to_the_source() -> None:
     ledger = joined(Ledger(), topics=(Route("/a", "/b"), Route("/c", "/d", reverse=True)))
-    assert ledger.is_carried_to("t", "/b")
-    assert ledger.is_carried_to("s", "/c")
-    assert not ledger.is_carried_to("t", "/d")
+    assert ledger.ids_with("brings", "t", "/b")
+    assert ledger.ids_with("brings", "s", "/c")
+    assert not ledger.ids_with("brings", "t", "/d")
 
 
 @pytest.mark.parametrize("kind", [ZENOH, ROS])
@@ -65,7 +65,7 @@ def test_links_are_known_at_both_nodes_as_long_as_somebody_holds_them(kind: Conn
     ledger = joined(ledger, type=kind, id="d", target="u")
 
     def known(ledger: Ledger) -> list[tuple[str, ...]]:
-        return [ledger.connections_at(kind, node) for node in "stu"]
+        return [ledger.ids_with("link", kind.name, node) for node in "stu"]
 
     assert known(ledger) == [("c", "d"), ("c",), ("d",)]
     for claim, at_target in zip(ledger.connection_claims("c"), [("c",), ()], strict=True):

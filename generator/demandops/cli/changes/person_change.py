@@ -144,7 +144,7 @@ def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
         warned_if_unnamed(repo.operator()), REAL.now(), edit.summary, one_line(edit.reason)
     )
     if not propose:
-        return person_commit.commit_to_main(repo.repository, lambda _: files, details)
+        return person_commit.commit_to_main(repo.repository, files, details)
     branch = f"override/{edit.name}"
     title, reason = harmless(one_line(edit.summary)), one_line(edit.reason)
     proposals = repo.last_valid_snapshot(repo.commit()).state.config.repo_settings.proposals

@@ -207,7 +207,7 @@ def _definition_faults(
             yield fault(f"services.{name}", message)
         elif not app.services.get(name):
             yield from _id_faults(f"services.{name}", "")
-    versions = config.versions_of(appdef.name)
+    versions = sorted(config.application_versions[appdef.name].keys() - {""})
     # An id that ends in '@<version>' belongs to a separate instance, which the generator names. A
     # claim that a person wrote, or an id that only looks like this, would share its names.
     id, _, version = app.id.rpartition("@")

@@ -52,13 +52,13 @@ def topic_faults(
         if isinstance(connection, Application):
             continue
         for index, both in carriers.chosen_twice(connection, apps, after.ledger) if chosen else ():
-            if not before.ledger.route_holders(connection.key_of(connection.topics[index])):
+            if not before.ledger.keys_with("route", *connection.key_of(connection.topics[index])):
                 message = f"{both}; choose another node"
                 yield item.fault(f"topics[{index}]", message, code="conflict")
         for index, route in enumerate(connection.topics):
             _, node = route.sender_and_receiver(*connection.nodes)
             topic = route.written_topic
-            if connection.id in before.ledger.connections_bringing(node, topic):
+            if connection.id in before.ledger.ids_with("brings", node, topic):
                 continue
             # Only services that run before and after the demand count. If an application moves, a
             # connection may bring the application's output back to the old node.
@@ -104,7 +104,7 @@ def _clashes_of_service(request: Demand, after: World, key: ServiceKey) -> Itera
         )
         connections = (
             (f"connection '{id}' already brings this topic to", None)
-            for id in after.ledger.connections_bringing(key.node, topic)
+            for id in after.ledger.ids_with("brings", key.node, topic)
         )
         for clash, other in chain[tuple[str, ServiceKey | None]](published, connections):
             remedy = _remedy(key, other, service, name, after.config)
@@ -134,7 +134,7 @@ def publishers(
                 elif service.scope == "cluster":
                     keys = [ServiceKey(service.name, node, for_cluster=True)]
                 else:
-                    ids = world.ledger.applications_at(node)
+                    ids = world.ledger.ids_with("node", node)
                     subjects = (Subject(SubjectKind.APPLICATION, id) for id in ids)
                     keys = (key for subject in subjects for key in keys_of(world, subject))
                 for key in keys:
@@ -158,7 +158,7 @@ def _keys_called(
             yield ServiceKey(name, node, for_cluster=service.scope == "cluster")
         return
     if role is None:
-        for id in ledger.applications_in_topics(instance):
+        for id in ledger.ids_with("topics", instance):
             yield ServiceKey(name, node, application=id)
         return
     for source in config.nodes_by_topic_part.get(instance, ()):

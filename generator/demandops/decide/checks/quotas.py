@@ -120,7 +120,7 @@ def quota_faults(before: World, after: World, changes: Changes) -> Iterator[Faul
     for (_, requester), domain in sorted(domains.items(), key=lambda pair: pair[0]):
         most = domain.quotas.claims_per_requester
         # The ledger has the count in all domains at hand. If even that fits, no search is needed.
-        if most is None or after.ledger.count_of_requester(requester) <= most:
+        if most is None or len(after.ledger.keys_with("requester", requester)) <= most:
             continue
         count = _held(requester, after, domain)
         if count > most and count > _held(requester, before, domain):
@@ -154,7 +154,7 @@ def _held(requester: str, world: World, domain: AccessDomain) -> int:
 
 def _running(node: str, world: World) -> int:
     world = overrides.without_suspended(world)
-    ids = world.ledger.applications_at(node)
+    ids = world.ledger.ids_with("node", node)
     subjects = (Subject(SubjectKind.APPLICATION, id) for id in ids)
     keys = {key for subject in subjects for key in keys_of(world, subject)}
     for name, service in world.config.definitions.items():

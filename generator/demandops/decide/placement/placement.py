@@ -338,7 +338,7 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
     # the application's node would get the same outputs twice.
     role = service.root or ""
     for topic in app.inputs.get(role, ()) if service.scope == "topic" else ():
-        for claim in world.ledger.claims_reading(topic.source, topic.topic):
+        for claim in world.ledger.claims_with("takes", topic.source, topic.topic):
             other = world.ledger.application(claim.subject.id) or claim.application
             if other.id == app.id or not candidates.shares(service, app, other):
                 continue

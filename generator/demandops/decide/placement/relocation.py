@@ -63,7 +63,7 @@ def with_moved(
     ledger, _ = carriers.without_idle_routes(ledger, world.config, changes)
     done |= {claim.key for claim in claims}
     moved = dict.fromkeys(claim.subject.id for claim in claims)
-    reading = [each.key for id in moved for each in ledger.claims_reading_outputs(id)]
+    reading = [each.key for id in moved for each in ledger.claims_with("reads", id)]
     for reader in filter(None, (ledger.get(key) for key in reading if key not in done)):
         follow = partial(chains.followed, demand=reader.demand, ledger=ledger, config=world.config)
         if follow(reader.application) != reader.application:
@@ -159,7 +159,7 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
     """Return the ids of the applications on a node, or with a service placed on it, sorted."""
     if not ledger.applications_on.get(node):
         return []
-    apps = ((id, ledger.application(id)) for id in ledger.applications_at(node))
+    apps = ((id, ledger.application(id)) for id in ledger.ids_with("node", node))
     return [id for id, app in apps if app and node in app.chosen_nodes]
 
 
@@ -251,7 +251,7 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
     """
     ids = [subject.id for subject in subjects or () if subject.kind is SubjectKind.APPLICATION]
     if subjects is None:
-        ids = [*world.ledger.moved_applications()]
+        ids = [*world.ledger.ids_with("moved")]
         if any(override.node for override in world.overrides):
             ids = sorted(world.ledger.subjects(SubjectKind.APPLICATION))
     change = partial(overrides.with_overridden_nodes, world=world)

@@ -300,5 +300,7 @@ def is_bridged(key: RouteKey, config: Config) -> bool:
 def flows_without_carrier(config: Config, app: Application, ledger: Ledger) -> Iterator[Flow]:
     for flow in flows(config, app):
         key = RouteKey(flow.sender, flow.topic, flow.receiver, flow.target)
-        if not ledger.is_carried_to(flow.receiver, flow.target) and not is_bridged(key, config):
+        if not ledger.ids_with("brings", flow.receiver, flow.target) and not is_bridged(
+            key, config
+        ):
             yield flow

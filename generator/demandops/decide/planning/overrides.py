@@ -12,7 +12,7 @@ from demandops.model.config.override import Override, Selector, Shaping
 from demandops.model.config.policy import matches
 from demandops.model.demand.demand import Application, Item
 from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim, ClaimKey, requesters_of
-from demandops.model.ledger.ledger import Ledger, World
+from demandops.model.ledger.ledger import By, Ledger, World
 from demandops.model.release import Release, ServiceRelease, claims_of, overridden
 
 # ---- effects on claims: ``deny`` suspends claims, ``keep`` books further claims ----
@@ -125,12 +125,8 @@ class UnsuspendedClaims(Ledger):
             asked.add("")
         return asked
 
-    def is_carried_to(self, target: str, topic: str) -> bool:
-        return bool(self.connections_bringing(target, topic))
-
-    def _ids(self, *entry: str) -> tuple[str, ...]:
-        keys = self.index.get(entry) or ()
-        return tuple(sorted({key.subject.id for key in keys if self.get(key)}))
+    def ids_with(self, by: By, *words: str) -> tuple[str, ...]:
+        return tuple(sorted({claim.subject.id for claim in self.each_with(by, *words)}))
 
     def _is_active(self, claim: Claim) -> bool:
         return self.world is None or suspended_by(claim, self.world) is None
@@ -178,7 +174,7 @@ def update_kept_claims(
     for subject in subjects:
         existing = [*ledger.kept_claims(subject), *before.kept_claims(subject)]
         needed = None
-        if ledger.is_only_kept(subject):
+        if len(ledger.claims_on(subject)) == len(ledger.kept_claims(subject)):
             needed = _kept_claim(existing, before.claims_on(subject), after, now)
         keys += [claim.key for claim in existing]
         ledger = ledger.without(existing)

@@ -232,7 +232,7 @@ class _ClaimedConnections:
     type: ConnectionType
 
     def at(self, node: str) -> Iterable[str]:
-        return self.world.ledger.connections_at(self.type, node)
+        return self.world.ledger.ids_with("link", self.type.name, node)
 
     def get(self, id: str) -> Connection | None:
         first, claims = self.world.ledger.connection(id), self.world.ledger.connection_claims(id)

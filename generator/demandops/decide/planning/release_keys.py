@@ -131,11 +131,11 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
         return ledger.application_claims(key.application) if needed else ()
     if key.for_cluster:
         users = world.config.users_of(key.service)
-        claims = tuple(claim for name in users for claim in ledger.claims_of_definition(name))
+        claims = tuple(claim for name in users for claim in ledger.claims_with("definition", name))
     elif key.scope == "node":
-        claims = ledger.claims_at(key.node)
+        claims = ledger.claims_with("node", key.node)
     else:
-        claims = ledger.claims_reading(str(key.source), str(key.topic))
+        claims = ledger.claims_with("takes", str(key.source), str(key.topic))
     services = {id: _service(world, id, key) for id in {claim.subject.id for claim in claims}}
     return tuple(
         claim
@@ -148,7 +148,7 @@ def is_needed(world: World, key: ReleaseKey) -> bool:
     """Return whether a claim needs a release; suspended claims in ``world`` count."""
     if isinstance(key, ClientKey):
         if key.side is None:
-            return bool(world.ledger.connections_at(key.type, key.id))
+            return bool(world.ledger.ids_with("link", key.type.name, key.id))
         connection = world.ledger.connection(key.id)
         return connection is not None and connection.type is key.type
     if key.application is not None:
@@ -158,7 +158,7 @@ def is_needed(world: World, key: ReleaseKey) -> bool:
     # Thousands of claims may read a topic. This ends at the first that needs the instance.
     return any(
         service is not None and takes(claim.application, service, key)
-        for claim in world.ledger.each_reading(str(key.source), str(key.topic))
+        for claim in world.ledger.each_with("takes", str(key.source), str(key.topic))
         for service in (_service(world, claim.subject.id, key),)
     )
 

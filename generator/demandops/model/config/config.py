@@ -207,9 +207,6 @@ class Config:
                 return appdef
         return None
 
-    def versions_of(self, appdef: str) -> list[str]:
-        return sorted(self.application_versions[appdef].keys() - {""})
-
     def versions_file(self, appdef: str) -> str:
         if appdef in self.versions:
             return self.file_of(VERSIONS_FILE, appdef)

@@ -235,10 +235,6 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
     def path(self) -> str:
         return f"{OVERRIDES_ROOT}/{self.name}.yaml"
 
-    @property
-    def rank(self) -> tuple[int, str]:
-        return (self.priority, self.name)
-
 
 @dataclass(frozen=True, slots=True)
 class Shaping:
@@ -291,14 +287,4 @@ def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) ->
 
 def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
     # the order in which they apply; the last one wins
-    return tuple(sorted(overrides, key=lambda override: override.rank))
-
-
-def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
-    # `ended` has the expiry of each override when it ended
-    return [
-        override
-        for name, override in overrides.items()
-        # a person who extends an ended override gives it a new expiry, and so it is active again
-        if override.end is None or ended.get(name) != format_time(override.end)
-    ]
+    return tuple(sorted(overrides, key=lambda override: (override.priority, override.name)))

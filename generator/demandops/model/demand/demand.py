@@ -253,11 +253,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         same = takewhile(lambda t: (t.topic, t.source) == place, islice(inputs, start, None))
         return tuple(same)
 
-    def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        return self._further_by_part.get((role, part), [])
-
     @cached_property
-    def _further_by_part(self) -> dict[tuple[str, str], list[InputTopic]]:
+    def further_by_part(self) -> dict[tuple[str, str], list[InputTopic]]:
         # computed only once, because the plans of many services need it
         by_part: dict[tuple[str, str], list[InputTopic]] = {}
         for role, topic in self.all_inputs():
@@ -450,12 +447,6 @@ class Lease:
             return self
         # the end never moves to an earlier time, because the clock may have been set back
         return replace(wanted, until=max(wanted.until, self.until))
-
-
-def renewed(current: Lease | None, term: Term | None, now: datetime) -> Lease | None:
-    if term is None:
-        return None
-    return current.renewed(term, now) if current else term.lease_from(now)
 
 
 # ---- demands ----

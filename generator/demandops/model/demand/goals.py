@@ -320,6 +320,11 @@ _NOT_A_MAPPING = (
     "a request is a mapping with the fields of a Demand (kind, demand, requesters and so on), or "
     "with id, apps, connections and shutdown"
 )
+_NOT_PLAIN = fault(
+    "",
+    f"the goal is not plain data, or is nested more than {strict_yaml.MAX_DEPTH} deep; give only "
+    "text, numbers, true, false, null, lists and mappings",
+)
 
 
 def form_faults(goal: object) -> Sequence[Fault]:
@@ -344,45 +349,25 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
         # exactly what a restart would read from the journal, so that it decides the same
         goal = json.loads(json.dumps(goal))
     except (TypeError, ValueError, RecursionError):
-        goal = _TOO_DEEP
+        raise Refused([_NOT_PLAIN]) from None
     # before anything is parsed, because the parser's work grows with the goal
     if large := list(length_faults(goal, limits)):
         raise Refused(large)
-    if goal is _TOO_DEEP or _is_deeper(goal, strict_yaml.MAX_DEPTH):
-        message = f"the goal is not plain data, or is nested more than {strict_yaml.MAX_DEPTH} "
-        message += "deep; give only text, numbers, true, false, null, lists and mappings"
-        raise Refused([fault("", message)])
-    if not isinstance(goal, dict):
-        raise Refused([fault("", _NOT_A_MAPPING)])
     faults: list[Fault] = []
-    data: dict[str, Any] = _in_one_form(goal, (), faults)
+    data = _in_one_form(goal, (), faults)
+    if not isinstance(data, dict):
+        raise Refused([fault("", _NOT_A_MAPPING)])
     if faults:
         raise Refused(faults)
-    if not is_demand_goal(data):
-        demand = _parsed(WireGoal, data, faults)
-    else:
-        united, faults = _with_parameters(data)
-        demand = _parsed(DemandGoal, united, faults)
-    return replace(demand, goal=data)
-
-
-def _parsed(
-    model: type[DemandGoal | WireGoal], goal: dict[str, Any], faults: list[Fault]
-) -> Demand:
+    model: type[DemandGoal | WireGoal] = DemandGoal if is_demand_goal(data) else WireGoal
+    united, faults = _with_parameters(data) if model is DemandGoal else (data, [])
     try:
-        parsed = model.model_validate(goal, context=GOAL)
+        parsed = model.model_validate(united, context=GOAL)
     except ValidationError as error:
         raise Refused([*faults, *faults_of(error, model, most=MOST_FAULTS)]) from None
     if faults := [*faults, *parsed.faults()]:
         raise Refused(faults)
-    return parsed.read()
-
-
-def _is_deeper(value: object, levels: int) -> bool:
-    if not isinstance(value, dict | list):
-        return False
-    parts = value.values() if isinstance(value, dict) else value
-    return levels == 0 or any(_is_deeper(part, levels - 1) for part in parts)
+    return replace(parsed.read(), goal=data)
 
 
 def is_unicode(text: str) -> bool:
@@ -396,6 +381,8 @@ _OWN_VALUES = frozenset({"parameters", "parameters_json"})
 
 def _in_one_form(value: Any, location: tuple[int | str, ...], faults: list[Fault]) -> Any:  # noqa: ANN401
     """Return plain data with its ids in one form of Unicode; collect a fault for each wrong key."""
+    if isinstance(value, dict | list) and len(location) >= strict_yaml.MAX_DEPTH:
+        raise Refused([_NOT_PLAIN])
     if isinstance(value, list):
         return [_in_one_form(part, (*location, at), faults) for at, part in enumerate(value)]
     if isinstance(value, dict):

@@ -11,7 +11,7 @@ import json
 import re
 from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import datetime, timezone
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field
@@ -82,6 +82,8 @@ class Claim:
         if self.keeping_override is not None:
             yield ("kept",)
             yield ("kept", self.subject.kind.value, self.subject.id)
+        if self.lease:
+            yield ("ends", minute_of(self.lease.expires_at))
         yield from self.held.index_entries()
 
     def extending(self, current: Claim) -> Claim:
@@ -103,6 +105,11 @@ class Claim:
         # that is sent again, would change the claim's file.
         kept = replace(self, booked=current.booked)
         return kept if replace(kept, lease=current.lease) == current else self
+
+
+def minute_of(moment: datetime) -> str:
+    # in UTC, and sorts like the time
+    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
 
 
 def requesters_of(claims: Iterable[Claim]) -> tuple[str, ...]:

@@ -5,29 +5,49 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timezone
+from datetime import datetime
 from operator import attrgetter
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 from rpds import HashTrieMap, HashTrieSet
 
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import connection_types
-from demandops.connections.connection import Connection, ConnectionType, RouteKey
+from demandops.connections.connection import Connection
 from demandops.model.config.config import Config
-from demandops.model.config.override import Override, by_rank, still_active
+from demandops.model.config.override import Override, by_rank, format_time
 from demandops.model.demand.demand import UNSTARTED, Application, InputTopic
-from demandops.model.ledger.claim import Claim, ClaimKey
+from demandops.model.ledger.claim import Claim, ClaimKey, minute_of
 from demandops.model.ledger.records import WaitingDemands
 
 # ---- the ledger: which demand holds which subject, as a set of persistent maps ----
 #
 # A :class:`Ledger` never changes, because each request makes a new one.
 
-_ENDS = "ends"
 _DEMAND = attrgetter("demand")
 
 Entry: TypeAlias = "tuple[str, ...]"
+# The first word of an entry: by what a claim is found. The further words name it.
+By = Literal[
+    "demand",
+    "requester",
+    "kept",  # by an override; also with kind and id of its subject
+    "ends",  # the minute
+    "node",  # of applications that run on, read from or deliver to the node
+    "definition",
+    "moved",  # applications, by an override
+    "takes",  # source and topic of an input
+    "reads",  # the application of an output that is an input
+    "from",  # the node of which it reads a topic, or carries one
+    "further",  # the part of a topic's name for an input that is not the usual topic
+    "usual",  # source and role; also with the topic
+    "version",  # application and version
+    "topics",  # the part of a topic's name that replaces `{instance}`
+    "link",  # type of the connection, and one of its nodes
+    "broker",  # the node
+    "route",  # the words of a RouteKey
+    "brings",  # the node and the topic to which a connection brings it
+]
 Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
 
 
@@ -85,112 +105,74 @@ class Ledger:
         others = len(self.application_claims(application)) > sum(counts.values())
         return {*counts, ""} if others else {*counts}
 
+    def keys_with(self, by: By, *words: str) -> Collection[ClaimKey]:
+        return self.index.get((by, *words)) or ()
+
+    def ids_with(self, by: By, *words: str) -> tuple[str, ...]:
+        return tuple(sorted({key.subject.id for key in self.keys_with(by, *words)}))
+
+    def each_with(self, by: By, *words: str) -> Iterator[Claim]:
+        # in no order, without the cost of sorting
+        return (claim for key in self.keys_with(by, *words) if (claim := self.get(key)))
+
+    def claims_with(self, by: By, *words: str) -> tuple[Claim, ...]:
+        keys = sorted(
+            self.keys_with(by, *words),
+            key=lambda key: (key.subject.kind.value, key.subject.id, key.demand),
+        )
+        return tuple(claim for key in keys if (claim := self.get(key)))
+
     def subjects(self, kind: SubjectKind) -> list[str]:
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
-    def claims_reading(self, source: str, topic: str) -> tuple[Claim, ...]:
-        return self._claims("takes", source, topic)
-
-    def each_reading(self, source: str, topic: str) -> Iterator[Claim]:
-        # in no order, without the cost of sorting
-        for key in self.index.get(("takes", source, topic)) or ():
-            claim = self.get(key)
-            if claim is not None:
-                yield claim
-
-    def claims_reading_outputs(self, application: str) -> tuple[Claim, ...]:
-        return self._claims("reads", application)
-
-    def claims_from(self, node: str) -> Iterator[Claim]:
-        # that read a topic of the node or carry one from it, in no order
-        keys = self.index.get(("from", node)) or ()
-        return (claim for key in keys if (claim := self.get(key)))
-
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
-        for claim in self.each_reading(source, topic):
+        for claim in self.each_with("takes", source, topic):
             if inputs := claim.application.inputs_from(role, source, topic):
                 return inputs[0]
         return None
 
     def has_usual_topic(self, role: str, source: str, *, except_demand: str | None = None) -> bool:
-        keys = self.index.get(("usual", source, role)) or ()
+        keys = self.keys_with("usual", source, role)
         return any(key.demand != except_demand for key in keys)
 
     def usual_topics(self, role: str, source: str, *, excluded: str) -> Iterator[str]:
-        keys = self.index.get(("usual", source, role)) or ()
-        if len(keys) == len(self.index.get(("usual", source, role, excluded)) or ()):
+        same = self.keys_with("usual", source, role, excluded)
+        if len(self.keys_with("usual", source, role)) == len(same):
             return  # all these claims have the topic ``excluded``
-        claims = (claim for key in keys if (claim := self.get(key)))
+        claims = self.each_with("usual", source, role)
         inputs = (topic for claim in claims for topic in claim.application.inputs.get(role, ()))
         usual = {topic.topic for topic in inputs if topic.source == source and not topic.further}
         yield from sorted(usual - {excluded})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
         # (input, version of a separate instance), for inputs that topic names show as `part`
-        for claim in self._claims("further", part):
+        for claim in self.claims_with("further", part):
             app = claim.application
-            yield from ((topic, app.own_version) for topic in app.further_inputs(role, part))
-
-    def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
-        return self._ids("brings", target, topic)
-
-    def claims_bringing(self, target: str, topic: str) -> tuple[Claim, ...]:
-        return self._claims("brings", target, topic)
-
-    def route_holders(self, key: RouteKey) -> Collection[ClaimKey]:
-        return self.index.get(("route", *key)) or ()
-
-    def bringing(self, target: str, topic: str) -> Collection[ClaimKey]:
-        return self.index.get(("brings", target, topic)) or ()
-
-    def is_carried_to(self, target: str, topic: str) -> bool:
-        return ("brings", target, topic) in self.index
+            further = app.further_by_part.get((role, part), ())
+            yield from ((topic, app.own_version) for topic in further)
 
     def claims_of_demand(self, demand: str) -> tuple[Claim, ...]:
-        return self._claims("demand", demand)
+        return self.claims_with("demand", demand)
 
     def kept_claims(self, subject: Subject | None = None) -> tuple[Claim, ...]:
-        return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
-
-    def moved_applications(self) -> tuple[str, ...]:
-        return self._ids("moved")
-
-    def is_only_kept(self, subject: Subject) -> bool:
-        return len(self.claims_on(subject)) == len(self.kept_claims(subject))
+        return self.claims_with("kept", *([subject.kind.value, subject.id] if subject else []))
 
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
-        return self._claims("requester", requester)
-
-    def count_of_requester(self, requester: str) -> int:
-        return len(self.index.get(("requester", requester)) or ())
-
-    def claims_of_definition(self, appdef: str) -> tuple[Claim, ...]:
-        return self._claims("definition", appdef)
-
-    # on applications that run on, read from or deliver to the node
-    def claims_at(self, node: str) -> tuple[Claim, ...]:
-        return self._claims("node", node)
-
-    def applications_at(self, node: str) -> tuple[str, ...]:
-        return self._ids("node", node)
-
-    # those for which `part` replaces `{instance}`
-    def applications_in_topics(self, part: str) -> tuple[str, ...]:
-        return self._ids("topics", part)
+        return self.claims_with("requester", requester)
 
     def next_lease_end(self) -> datetime | None:
         # of the lease with its slack; `UNSTARTED` if none started
-        claims = (claim for key in self.first_to_end() or () if (claim := self.get(key)))
+        claims = self.each_with("ends", min(self.minutes)) if self.minutes else ()
         return min((claim.lease.expires_at for claim in claims if claim.lease), default=None)
 
     def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
         # those that end in the earliest minute: the same object until a claim enters the set,
         # leaves it or gets another lease
-        return self.index.get((_ENDS, min(self.minutes))) if self.minutes else None
+        return self.index.get(("ends", min(self.minutes))) if self.minutes else None
 
     def unstarted_claims(self) -> tuple[Claim, ...]:
         later = (minute for minute in self.minutes if minute >= minute_of(UNSTARTED))
-        claims = (claim for minute in sorted(later) for claim in self._claims(_ENDS, minute))
+        claims = (claim for minute in sorted(later) for claim in self.claims_with("ends", minute))
         return tuple(claim for claim in claims if claim.lease and not claim.lease.has_started)
 
     def ended_claims(self, now: datetime) -> tuple[Claim, ...]:
@@ -199,29 +181,16 @@ class Ledger:
         ended = [
             (claim.lease.expires_at, claim)
             for minute in over
-            for claim in self._claims(_ENDS, minute)
+            for claim in self.claims_with("ends", minute)
             if claim.lease and claim.lease.has_ended(now)
         ]
         return tuple(claim for _, claim in sorted(ended, key=lambda pair: pair[0]))
 
-    def _ids(self, *entry: str) -> tuple[str, ...]:
-        return tuple(sorted({key.subject.id for key in self.index.get(entry) or ()}))
-
-    def _claims(self, *entry: str) -> tuple[Claim, ...]:
-        keys = sorted(
-            self.index.get(entry) or (),
-            key=lambda key: (key.subject.kind.value, key.subject.id, key.demand),
-        )
-        return tuple(claim for key in keys if (claim := self.get(key)))
-
-    def connections_at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
-        return self._ids("link", kind.name, node)
-
     def connections_needing(self, node: str) -> tuple[str, ...]:
         # those from or to a node, or that name its broker
-        ids = set(self._ids("broker", node))
+        ids = set(self.ids_with("broker", node))
         for kind in connection_types.CONNECTION_TYPES:
-            ids |= {*self.connections_at(kind, node)}
+            ids |= {*self.ids_with("link", kind.name, node)}
         return tuple(sorted(ids))
 
     def indexed_names(self, entry: str) -> set[str]:
@@ -240,20 +209,20 @@ class Ledger:
         place = bisect_left(held, key.demand, key=_DEMAND)
         held = held[:place] + ((claim,) if claim else ()) + held[place + (old is not None) :]
         claims = self.claims.insert(key.subject, held) if held else self.claims.remove(key.subject)
-        before, after = index_entries(old), index_entries(claim)
+        before, after = ({*each.index_entries()} if each else set[Entry]() for each in (old, claim))
         index, minutes = self.index, self.minutes
         for entry in before - after:
             others = index[entry].remove(key)
             index = index.insert(entry, others) if others else index.remove(entry)
-            if not others and entry[0] == _ENDS:
+            if not others and entry[0] == "ends":
                 minutes = minutes.remove(entry[1])
         added = after - before
         if old and claim and old.lease != claim.lease:
             # so that first_to_end returns a new object, by which the expiry sees the change
-            added |= {entry for entry in after if entry[0] == _ENDS}
+            added |= {entry for entry in after if entry[0] == "ends"}
         for entry in added:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
-            if entry[0] == _ENDS:
+            if entry[0] == "ends":
                 minutes = minutes.insert(entry[1])
         counts = self.applications_on
         if key.subject.kind is SubjectKind.APPLICATION:
@@ -291,18 +260,6 @@ def ledger_of(claims: Iterable[Claim]) -> Ledger:
     for claim in claims:
         ledger = ledger.replace(claim.key, claim)
     return ledger
-
-
-def minute_of(moment: datetime) -> str:
-    # in UTC, and sorts like the time
-    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
-
-
-def index_entries(claim: Claim | None) -> set[Entry]:
-    entries = set(claim.index_entries()) if claim else set()
-    if claim and claim.lease:
-        entries.add((_ENDS, minute_of(claim.lease.expires_at)))
-    return entries
 
 
 # ---- what a request changes in the ledger: claims, and other records ----
@@ -368,5 +325,10 @@ class World:
     overrides: tuple[Override, ...] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        active = by_rank(still_active(self.config.overrides, self.ledger.ended))
-        object.__setattr__(self, "overrides", active)
+        active = [
+            override
+            for name, override in self.config.overrides.items()
+            # a person who extends an ended override gives it a new end, and so it is active again
+            if override.end is None or self.ledger.ended.get(name) != format_time(override.end)
+        ]
+        object.__setattr__(self, "overrides", by_rank(active))

@@ -58,10 +58,6 @@ class Snapshot:
     def config_source(self) -> ConfigSource:
         return self.other_config_source or ConfigSource(self.commit)
 
-    def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        last_valid_commit = self.last_valid_commit if self.problems else commit
-        return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
-
 
 @dataclass(frozen=True, slots=True)
 class Advance:

@@ -111,7 +111,8 @@ class CommitBatch:
                 if attempt == _ATTEMPTS:
                     raise
                 self._repository.runtime.sleep(_PAUSE_S * attempt)
-        self.head = self.head.with_commit(commit, state)
+        valid = self.head.last_valid_commit if self.head.problems else commit
+        self.head = replace(self.head, commit=commit, state=state, last_valid_commit=valid)
         return str(commit)
 
     def record_in_next_commit(self, operation: str, outcome: commit_log.Settled) -> None:

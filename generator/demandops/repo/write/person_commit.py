@@ -16,7 +16,6 @@ from demandops.base.errors import Fault, InvalidInput, StateRepoError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
-from demandops.decide.changeset import FileReader
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import MAIN, StateRepository
 from demandops.repo.history import commit_message
@@ -54,11 +53,8 @@ class Published:
     link: str = ""  # the address of the branch's merge request, if the server printed it
 
 
-def commit_to_main(
-    repository: StateRepository, make: Callable[[FileReader], Files], details: CommitDetails
-) -> Published:
-    # ``make`` reads files of main; it is called again if main gets other commits meanwhile
-    return _publish(repository, lambda tip: (make(_reader(tip.tree)), [tip.id]), details)
+def commit_to_main(repository: StateRepository, files: Files, details: CommitDetails) -> Published:
+    return _publish(repository, lambda tip: (files, [tip.id]), details)
 
 
 def commit_to_branch(
@@ -115,8 +111,8 @@ def merge(
                     f"{path} in {proposal.branch} is not a plain text file; merge the branch with "
                     "git"
                 )
-        read = _reader(head.tree)
-        return {path: read(path) for path in proposed}, [tip.id, head.id]
+        texts = {path: trees.read_text(head.tree, path) for path in proposed}
+        return texts, [tip.id, head.id]
 
     return _publish(repository, make, details)
 
@@ -167,7 +163,3 @@ def _config_faults(tree: Tree) -> set[Fault]:
     except InvalidInput as error:
         return {*error.faults}
     return set()
-
-
-def _reader(tree: Tree) -> FileReader:
-    return lambda path: trees.read_text(tree, path)
