@@ -194,8 +194,7 @@ def misspelled_topic_warnings(world: World) -> Iterator[Fault]:
 def _named_topics(held: Application | Connection) -> list[tuple[str, str]]:
     if isinstance(held, Application):
         return [(topic.source, topic.topic) for _, topic in held.all_inputs()]
-    ends = held.source, held.target
-    return [(route.sender_and_receiver(*ends)[0], route.read_topic) for route in held.topics]
+    return [(key.sender, key.topic) for key in map(held.key_of, held.topics)]
 
 
 class _KnownTopics:

@@ -108,7 +108,8 @@ def keys_of_claims(
     for claim in claims:
         if not claim.is_on_application:
             connection = world.ledger.connection(claim.subject.id) or claim.connection
-            keys |= dict.fromkeys(connection.known_type.keys(connection.id, *connection.nodes))
+            assert connection.type is not None, connection.id  # noqa: S101 - a claim has one
+            keys |= dict.fromkeys(connection.type.keys(connection.id, *connection.nodes))
             continue
         # The first claim on an application decides its appdef and nodes for all claims on it.
         first = world.ledger.application(claim.subject.id) or claim.application
