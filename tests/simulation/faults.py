@@ -227,7 +227,7 @@ plant("leave_drained_nodes_full", 8, Draining, "is_due", nothing)
 plant("leave_drained_nodes_full", 8, Draining, "move_due", nothing)
 plant("place_on_drained_nodes", 1, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 5, placement, "_booked", nothing)
-plant("count_no_room", 2, capacity, "exceeded", lambda *_: [])
+plant("count_no_room", 2, capacity, "excesses", lambda *_: [])
 
 
 @wrong(1, Usage, "plus")

@@ -114,7 +114,7 @@ class _StandingRoutes:
                 # from another node, only an earlier goal of the demand itself brings it
                 if key.sender != flow.sender and not (is_join and was_listed):
                     continue
-                if key.topic != flow.topic and (flow.is_output or flow.delivery is not None):
+                if key.topic != flow.topic and ("." in flow.name or flow.delivery is not None):
                     continue
                 # a put gives up what it listed and lists no longer
                 if key.topic != flow.topic and was_listed and not is_join:

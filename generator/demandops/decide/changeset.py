@@ -96,7 +96,14 @@ def plan_change(
     ``keys`` are those of the releases that may differ, and ``plans`` are releases of ``before``
     that are planned already. ``checkpoint`` may raise an exception to end the work.
     """
-    files = _ledger_files(after.ledger, changes, checkpoint)
+    files: dict[str, str | None] = {}
+    for change in changes.claims:
+        checkpoint()
+        path = claim_files.path_of(change.key)
+        files[path] = claim_files.text_of(change.after) if change.after else None
+    for demand in changes.waiting:
+        waits = after.ledger.waiting.get(demand)
+        files[records.waiting_path(demand)] = records.waiting_text(waits) if waits else None
     # before anything is planned, because a claim's file is the smallest of the files that need it
     _refuse_large(files, after.config.repo_settings.limits.file_bytes, read)
     now, former = dict[ReleaseKey, Release | None](), dict[ReleaseKey, Release | None]()
@@ -156,20 +163,6 @@ def render_change(
     _refuse_large(files, config.repo_settings.limits.file_bytes, read)
     releases.sort(key=lambda change: change.order)
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
-
-
-def _ledger_files(
-    ledger: Ledger, changes: Changes, checkpoint: Callable[[], None]
-) -> dict[str, str | None]:
-    files: dict[str, str | None] = {}
-    for change in changes.claims:
-        checkpoint()
-        path = claim_files.path_of(change.key)
-        files[path] = claim_files.text_of(change.after) if change.after else None
-    for demand in changes.waiting:
-        waits = ledger.waiting.get(demand)
-        files[records.waiting_path(demand)] = records.waiting_text(waits) if waits else None
-    return files
 
 
 def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
@@ -261,7 +254,12 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
     kind: Change = "stop" if not new else "change" if existed else "start"
     details: list[str] = []
     if new and existed:
-        before, after = _overrides(old), _overrides(new)
+        before, after = (
+            [f"{override.path}: {', '.join(effects)}" for override, effects in side.shaping.by]
+            if side
+            else []
+            for side in (old, new)
+        )
         if not new.shaping.held:  # in a held file, only the comments that name overrides change
             before = (old.facts() if old else []) + before
             after = new.facts() + after
@@ -269,11 +267,6 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
         details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
         details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
     return ReleaseChange(release.name, release.description, path_of(release), kind, tuple(details))
-
-
-def _overrides(release: Release | None) -> list[str]:
-    by = release.shaping.by if release is not None else ()
-    return [f"{override.path}: {', '.join(effects)}" for override, effects in by]
 
 
 # ---- trial demands: a new configuration must render before real demands arrive ----

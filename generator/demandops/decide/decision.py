@@ -20,7 +20,6 @@ from demandops.decide import carriers, changeset, rollback, warnings
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.completing import (
     completed,
-    notes_on_instances,
     prepared,
     with_definitions,
     with_separate_instances,
@@ -40,6 +39,7 @@ from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Application, Demand
 from demandops.model.demand.goals import goal_field, read_goal
+from demandops.model.ledger.claim import demand_id
 from demandops.model.ledger.ledger import Changes, World, claim_changes, ledger_of
 from demandops.model.ledger.records import Wait, WaitingDemand
 
@@ -110,6 +110,7 @@ class Decision:
 Throttle = Callable[[Demand, Config], Iterable[Fault]]
 # Is called often during a decision, and raises OverBudget to end it.
 Checkpoint = Callable[[], None]
+_NO_LIMIT: Checkpoint = lambda: None  # noqa: E731
 
 
 def decide(
@@ -119,7 +120,7 @@ def decide(
     read: FileReader,
     on_stage: Callable[[Stage], None] = lambda stage: None,
     throttle: Throttle = lambda demand, config: (),
-    checkpoint: Checkpoint = lambda: None,
+    checkpoint: Checkpoint = _NO_LIMIT,
 ) -> Decision:
     """Return the decision on a demand, or on its goal as plain data.
 
@@ -144,7 +145,7 @@ def decide(
     demand = read_goal(goal, state.config.repo_settings.limits)
     # what was booked must be released, however long that takes
     if demand.is_complete or not demand.adds_claims:
-        checkpoint = _no_limit
+        checkpoint = _NO_LIMIT
     tell = cache(on_stage)  # once for each stage, because there may be several attempts
 
     def throttled(request: Demand) -> Demand:
@@ -182,10 +183,6 @@ class _TooSoon(Exception):
 
     def __init__(self, faults: tuple[Fault, ...]) -> None:
         self.faults = faults
-
-
-def _no_limit() -> None:
-    pass
 
 
 def _refused(state: State, demand: Demand, faults: Iterable[Fault]) -> Refused:
@@ -230,8 +227,8 @@ def admit(state: State, demand: Demand) -> Demand:
     return _searched(
         state,
         demand,
-        lambda request, faults: admitted(request, state, faults, _no_limit),
-        _no_limit,
+        lambda request, faults: admitted(request, state, faults, _NO_LIMIT),
+        _NO_LIMIT,
     )
 
 
@@ -432,7 +429,10 @@ def _once(*texts: str) -> tuple[str, ...]:
 def notes_on(
     request: Demand, before: World, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
-    yield from notes_on_instances(request)
+    for item in request.demanded:
+        if isinstance(item.held, Application) and item.held.separate:
+            id, _, version = item.held.id.rpartition("@")
+            yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"
     # a connection that an override denies carries nothing
     ledger = without_suspended(after).ledger
     for item in request.demanded if request.adds_claims else ():
@@ -450,7 +450,9 @@ def notes_on(
                 if change.after.connection.topics[index] not in former:
                     yield f"{words}; a subscriber gets the messages of both"
     yield from warnings.notes(request, before)
-    yield from warnings.unheld_output_notes(request, after)
+    for item in request.demanded if request.adds_claims else ():
+        demand = request.demand or demand_id(request.id, item.requesters)
+        yield from warnings.unheld_outputs(item.held, demand, after)
     yield from warnings.lost_output_notes(changes, after)
     yield from rendered.blocked
     if isinstance(request, Drain):

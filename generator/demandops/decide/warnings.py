@@ -25,7 +25,7 @@ from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.policy import AccessDomain, matches
 from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import ClaimKey, demand_id
+from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import Changes, World
 from demandops.templating import charts
 
@@ -93,17 +93,11 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
 
 def unheld_output_warnings(world: World) -> Iterator[Fault]:
     for claim in sorted(world.ledger, key=lambda claim: claim_files.path_of(claim.key)):
-        for note in _unheld_outputs(claim.held, claim.demand, world):
+        for note in unheld_outputs(claim.held, claim.demand, world):
             yield fault("", note).within(claim_files.path_of(claim.key))
 
 
-def unheld_output_notes(request: Demand, after: World) -> Iterator[str]:
-    for item in request.demanded if request.adds_claims else ():
-        demand = request.demand or demand_id(request.id, item.requesters)
-        yield from _unheld_outputs(item.held, demand, after)
-
-
-def _unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
+def unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
     if not isinstance(held, Application) or held.held_for:
         return
     services = (each for services in world.config.services.values() for each in services.values())
@@ -200,7 +194,7 @@ def _named_topics(held: Application | Connection) -> list[tuple[str, str]]:
 class _KnownTopics:
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._listed: dict[str, frozenset[str]] = {}
+        self._listed: dict[str, set[str]] = {}
         self._told: set[tuple[str, str]] = set()
 
     def notes_on(
@@ -214,7 +208,11 @@ class _KnownTopics:
         """
         what = "application" if isinstance(held, Application) else "connection"
         for node, topic in _named_topics(held):
-            listed, booked = self._of(node), earlier(node, topic)
+            if node not in self._listed:
+                entry = self._config.nodes.get(node)
+                own = {*entry.topics.values(), *entry.types} if entry else set[str]()
+                self._listed[node] = own.union(*entry.bridged.values()) if entry else own
+            listed, booked = self._listed[node], earlier(node, topic)
             if (node, topic) in self._told or topic in listed or topic in booked:
                 continue
             near = [each for each in (*listed, *booked) if _is_misspelling(topic, each)]
@@ -222,15 +220,6 @@ class _KnownTopics:
                 self._told.add((node, topic))
                 meant = f"did you mean '{min(near)}'?"
                 yield f"{what} '{held.id}': '{node}' is not known to publish {topic}; {meant}"
-
-    def _of(self, node: str) -> frozenset[str]:
-        if node not in self._listed:
-            entry = self._config.nodes.get(node)
-            topics = set[str]()
-            if entry:
-                topics = {*entry.topics.values(), *entry.types}.union(*entry.bridged.values())
-            self._listed[node] = frozenset(topics)
-        return self._listed[node]
 
 
 def _is_misspelling(topic: str, other: str) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from typing import NamedTuple
 
 from demandops.base import naming
@@ -40,7 +41,8 @@ def outputs(
         text = distinguishing_text(config, service.root, topic, key.version)
         instance = naming.topic_part(topic.source, text)
     return {
-        name: topic_name(pattern, instance) for name, pattern in sorted(service.outputs.items())
+        name: pattern.replace("{instance}", instance)
+        for name, pattern in sorted(service.outputs.items())
     }
 
 
@@ -54,11 +56,8 @@ def distinguishing_text(config: Config, role: str, topic: InputTopic, version: s
 # A fusion reads hundreds of such topics, and each demand plans the fusion again.
 @lru_cache(maxsize=65_536)
 def published_topic(pattern: str, source: str, distinguishing: str) -> InputTopic:
-    return InputTopic(topic_name(pattern, naming.topic_part(source, distinguishing)), source)
-
-
-def topic_name(pattern: str, instance: str) -> str:
-    return pattern.replace("{instance}", instance)
+    instance = naming.topic_part(source, distinguishing)
+    return InputTopic(pattern.replace("{instance}", instance), source)
 
 
 def usual_topic(config: Config, source: str, role: str) -> str | None:
@@ -88,10 +87,11 @@ def with_further_topics(request: AnyDemand, ledger: Ledger, config: Config) -> A
 
     apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
     # A usual topic that is booked stays the usual one, even if the request lists it after others.
-    for role, topic in (input for app in apps for input in _per_topic(app, config)):
-        booked = ledger.booked_input(role, topic.source, topic.topic)
-        if booked is not None and not booked.further:
-            first.setdefault((role, topic.source), topic.topic)
+    for app, role in product(apps, config.roles_with_services):
+        for topic in app.inputs.get(role, ()):
+            booked = ledger.booked_input(role, topic.source, topic.topic)
+            if booked is not None and not booked.further:
+                first.setdefault((role, topic.source), topic.topic)
     demanded = (
         replace(item, held=_marked(item.held, config, is_further))
         if isinstance(item.held, Application)
@@ -116,23 +116,15 @@ def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
     return ledger
 
 
-def _per_topic(app: Application, config: Config) -> Iterator[tuple[str, InputTopic]]:
-    """Yield (role, topic) for each input that may have a service instance of its own."""
-    for role in config.roles_with_services:
-        for topic in app.inputs.get(role, ()):
-            yield role, topic
-
-
 def _marked(
     app: Application, config: Config, is_further: Callable[[str, InputTopic], bool]
 ) -> Application:
-    marked: dict[str, list[InputTopic]] = {}
-    for role, topic in _per_topic(app, config):
-        further = is_further(role, topic)
-        marked.setdefault(role, []).append(replace(topic, further=further))
-    return app.with_inputs(
-        {**app.inputs, **{role: tuple(topics) for role, topics in marked.items()}}
-    )
+    marked = {  # inputs that may have a service instance of their own
+        role: tuple(replace(topic, further=is_further(role, topic)) for topic in app.inputs[role])
+        for role in config.roles_with_services
+        if role in app.inputs
+    }
+    return app.with_inputs({**app.inputs, **marked})
 
 
 # ---- flows: which topics the services of an application read, and where they come from ----
@@ -172,10 +164,6 @@ class Flow:
     root: TopicKey = ()
     delivery: int | None = None
     type: str = ""
-
-    @property
-    def is_output(self) -> bool:
-        return "." in self.name
 
 
 def node_of(app: Application, service: Service, source: str) -> str:
@@ -234,7 +222,7 @@ def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[
     if not producer.roots:
         node = node_of(app, producer, "")
         instance = naming.topic_part(app.id if producer.scope == "application" else node)
-        yield PublishedTopic(InputTopic(topic_name(pattern, instance), node), node)
+        yield PublishedTopic(InputTopic(pattern.replace("{instance}", instance), node), node)
         return
     version = version_of_instance(app, producer)
     for role in producer.roots:
