@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 
 from demandops.base.naming import SubjectKind, TopicKey, hash_of, id_problem, topic_problem
@@ -89,10 +89,10 @@ def _implied(flow: Flow, connect: Connect, route: Route) -> Connection:
 _ORDER = attrgetter("subject.id", "demand")  # of the keys of claims
 
 
+@dataclass(slots=True)
 class _StandingRoutes:
-    def __init__(self, ledger: Ledger) -> None:
-        self._ledger = ledger
-        self._by_target: dict[ClaimKey, dict[tuple[str, str], list[Route]]] = {}
+    ledger: Ledger
+    _by_target: dict[ClaimKey, dict[tuple[str, str], list[Route]]] = field(default_factory=dict)
 
     def serving(self, flow: Flow, request: Demand, demand: str) -> tuple[Claim, Route] | None:
         """Return the claim and route that bring an input already, perhaps by another source name.
@@ -102,8 +102,8 @@ class _StandingRoutes:
         """
         is_join = request.operation == "join"
         same = RouteKey(flow.sender, flow.topic, flow.receiver, flow.target)
-        bringing = self._ledger.bringing(flow.receiver, flow.target)
-        exact = sorted(self._ledger.route_holders(same), key=_ORDER)[:1]
+        bringing = self.ledger.bringing(flow.receiver, flow.target)
+        exact = sorted(self.ledger.route_holders(same), key=_ORDER)[:1]
         # thousands of claims may bring a topic, mostly by this very route
         others = bringing if not exact else ()
         for holders in ([each for each in bringing if each.demand == demand], exact, others):
@@ -126,7 +126,7 @@ class _StandingRoutes:
         return None
 
     def _bringing(self, holders: Iterable[ClaimKey], flow: Flow) -> Iterator[tuple[Claim, Route]]:
-        for claim in filter(None, map(self._ledger.get, sorted(holders, key=_ORDER))):
+        for claim in filter(None, map(self.ledger.get, sorted(holders, key=_ORDER))):
             if claim.key not in self._by_target:
                 routes: dict[tuple[str, str], list[Route]] = {}
                 for route in claim.connection.topics:
@@ -169,19 +169,22 @@ def with_carriers(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDema
     return replace(request, demanded=tuple(carriers.united()), notes=notes)
 
 
+@dataclass(slots=True)
 class _Carriers:
     """What the routes of a request are carried by; each is placed after those before it."""
 
-    def __init__(self, request: Demand, ledger: Ledger, config: Config) -> None:
-        self._request, self._ledger, self._config = request, ledger, config
-        self._is_put = request.operation == "put"
-        self.notes: list[str] = []
-        # The items in their order. A key stands for all that a demand has on one connection: that
-        # connection without topics, and the demand.
-        self.items: list[Item | tuple[Connection, str]] = []
-        self._routes: dict[tuple[Connection, str], list[tuple[Item, str, Route]]] = {}
-        self._above: dict[RouteKey, tuple[Connection, Route]] = {}
-        self._standing: dict[str, Connection] = {}
+    _request: Demand
+    _ledger: Ledger
+    _config: Config
+    notes: list[str] = field(default_factory=list)
+    # The items in their order. A key stands for all that a demand has on one connection: that
+    # connection without topics, and the demand.
+    items: list[Item | tuple[Connection, str]] = field(default_factory=list)
+    _routes: dict[tuple[Connection, str], list[tuple[Item, str, Route]]] = field(
+        default_factory=dict
+    )
+    _above: dict[RouteKey, tuple[Connection, Route]] = field(default_factory=dict)
+    _standing: dict[str, Connection] = field(default_factory=dict)
 
     def place(self, item: Item, listed: Connection, index: int, route: Route) -> None:
         key, request = listed.key_of(route), self._request
@@ -242,7 +245,7 @@ class _Carriers:
                 claim.connection
                 for claim in self._ledger.connection_claims(id)
                 # a put may change what it alone holds
-                if not (self._is_put and claim.demand == self._request.demand)
+                if self._request.operation != "put" or claim.demand != self._request.demand
             ]
             if not held:
                 return None

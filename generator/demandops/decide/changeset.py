@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Any, Literal
@@ -207,22 +207,23 @@ def render_all(
     return files | gitops.kept_charts(files, current, world)
 
 
+@dataclass(slots=True)
 class _Texts:
     """The texts of releases. A template that took too long for one is not tried for others."""
 
-    def __init__(self, config: Config, evaluate: Evaluate) -> None:
-        self._config, self._evaluate = config, evaluate
-        self._late: dict[str, OverLimit] = {}
-        self._used: dict[tuple[str, str], bool] = {}  # by template and parameter
+    config: Config
+    evaluate: Evaluate
+    _late: dict[str, OverLimit] = field(default_factory=dict)
+    _used: dict[tuple[str, str], bool] = field(default_factory=dict)  # by template and parameter
 
     def text_of(self, release: Release, current: str | None) -> str:
         template = ""
         if isinstance(release, ServiceRelease):
-            template = self._config.values_template(release.service)
+            template = self.config.values_template(release.service)
         if template in self._late:
             raise self._late[template]
         try:
-            return gitops.release_text(release, self._config, self._evaluate, current)
+            return gitops.release_text(release, self.config, self.evaluate, current)
         except OverLimit as error:
             self._late[template] = error
             raise
@@ -232,7 +233,7 @@ class _Texts:
         # that leaves the file as it is with its old value is no part of the change.
         if not isinstance(old, ServiceRelease) or not isinstance(new, ServiceRelease):
             return old
-        template, unused = self._config.values_template(new.service), dict[str, object]()
+        template, unused = self.config.values_template(new.service), dict[str, object]()
         for name, value in new.parameters.items():
             if new.shaping.held or old.parameters.get(name, value) == value:
                 continue

@@ -109,7 +109,8 @@ def update_ledger(
     ended |= {each.name: format_time(each.end) for each in expired if each.end}
     files: dict[str, str | None] = dict.fromkeys(stale)
     for override in expired:
-        files |= _marker(override)
+        path = records.ended_override_path(override.name)
+        files[path] = records.ended_override_text(override)
     after = replace(after, ledger=replace(after.ledger, ended=ended))
     kept = (*overrides.kept_subjects(before.ledger), *overrides.kept_subjects(after.ledger))
     update = update_claims(before.ledger, after, dict.fromkeys((*subjects, *kept)), now)
@@ -136,11 +137,8 @@ def end_override(world: World, override: Override, now: datetime) -> LedgerUpdat
     ended = {**world.ledger.ended, override.name: format_time(override.end)}
     after = replace(world, ledger=replace(world.ledger, ended=ended))
     update = update_ledger(world, after, (), {}, now)
-    return replace(update, files={**update.files, **_marker(override)})
-
-
-def _marker(override: Override) -> dict[str, str]:
-    return {records.ended_override_path(override.name): records.ended_override_text(override)}
+    marker = {records.ended_override_path(override.name): records.ended_override_text(override)}
+    return replace(update, files={**update.files, **marker})
 
 
 def changed_claim_files(

@@ -10,7 +10,7 @@ from demandops.connections.connection import Connection
 from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
-from demandops.decide.planning import chains
+from demandops.decide.planning import flows
 from demandops.decide.planning.overrides import with_overridden_nodes
 from demandops.decide.state import State
 from demandops.model.config.config import Config
@@ -35,7 +35,7 @@ def prepared(demand: AnyDemand, state: State) -> tuple[AnyDemand, list[Fault]]:
     # the id of a separate instance comes first, because the placement looks for claims on it
     demand = with_separate_instances(demand, config)
     demand, unclear = with_chosen_domains(demand, config, ledger)
-    demand, unread = chains.with_topics_of_outputs(demand, ledger, config)
+    demand, unread = flows.with_topics_of_outputs(demand, ledger, config)
     return demand, [*unclear, *unread]
 
 
@@ -54,10 +54,10 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
                     moved = with_overridden_nodes(app, state)
                 demanded[index] = replace(item, held=moved)
         demand = replace(demand, demanded=tuple(demanded))
-    if chains.reads_outputs(demand):
+    if flows.reads_outputs(demand):
         # again, because the nodes of listed applications may have been open
-        demand, _ = chains.with_topics_of_outputs(demand, ledger, config)
-        demand = chains.with_held_applications(demand, ledger, config)
+        demand, _ = flows.with_topics_of_outputs(demand, ledger, config)
+        demand = flows.with_held_applications(demand, ledger, config)
     demand = carriers.with_implied_routes(demand, ledger, config)
     checkpoint()
     # before what depends on the connection: its lease, type, permission, quota and approval

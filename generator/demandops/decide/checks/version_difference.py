@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from demandops.base.errors import Fault
 from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
-from demandops.decide.planning.release_keys import ReleaseKey, contents, newest_asked, same_version
+from demandops.decide.planning.release_keys import ReleaseKey, contents, newest_asked
 from demandops.model.config.appdef import VersionPolicy
 from demandops.model.config.registry import ApplicationVersion, precedence
 from demandops.model.demand.demand import Demand, Item
@@ -108,12 +108,12 @@ def _of_application(item: Item, claim: Claim, after: World) -> Iterator[Differen
         return
     others = ledger.replace(claim.key, None)
     own, theirs = versions.get(app.version, versions[""]), newest_asked(others, app.id, versions)
-    if same_version(own, theirs):
+    if own.rank == theirs.rank:
         return
     holders, held = "", ""
     for other in others.claims_on(app.subject):
         word = other.application.version
-        if same_version(versions.get(word, versions[""]), theirs):
+        if versions.get(word, versions[""]).rank == theirs.rank:
             holders, held = ", ".join(other.requesters), word if word in versions else ""
             break
     message = (
@@ -158,8 +158,13 @@ def _of_service(
         if own is None or contents(own, service) == contents(theirs, service):
             continue
         # The difference was there before the demand.
-        if same_version(release_keys.running_version(before, id), own) and any(
-            claim.application.id == id for claim in release_keys.claims_needing(before, key)
+        former = release_keys.running_version(before, id)
+        if (
+            former
+            and former.rank == own.rank
+            and any(
+                claim.application.id == id for claim in release_keys.claims_needing(before, key)
+            )
         ):
             continue
         # Versions of two definitions have names of their own, so the charts are compared.

@@ -19,8 +19,8 @@ from demandops.decide.checks.collisions import Names
 from demandops.decide.placement import candidates, capacity
 from demandops.decide.placement.candidates import Choice, Chosen, Room
 from demandops.decide.placement.capacity import Need, Usage
-from demandops.decide.planning import chains, overrides
-from demandops.decide.planning.flows import flows
+from demandops.decide.planning import overrides
+from demandops.decide.planning.flows import flows, with_booked_outputs
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.rollback import Restoration, request_for
 from demandops.model.config.appdef import Service
@@ -65,7 +65,9 @@ def with_moved(
     moved = dict.fromkeys(claim.subject.id for claim in claims)
     reading = [each.key for id in moved for each in ledger.claims_reading_outputs(id)]
     for reader in filter(None, (ledger.get(key) for key in reading if key not in done)):
-        follow = partial(chains.followed, demand=reader.demand, ledger=ledger, config=world.config)
+        follow = partial(
+            with_booked_outputs, demand=reader.demand, ledger=ledger, config=world.config
+        )
         if follow(reader.application) != reader.application:
             after, changes = with_moved(replace(world, ledger=ledger), [reader], follow, done)
             ledger, keys = after.ledger, [*keys, *(change.key for change in changes)]
@@ -263,9 +265,8 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
     ]
     keys, stays = list[ClaimKey](), list[tuple[str, str]]()
     names = collisions.all_names(world) if moving else collisions.NONE
-    groups = (
-        [moving] if moving else []
-    )  # applications that share a service must move at the same time
+    # applications that share a service must move at the same time
+    groups = [moving] if moving else []
     while groups:
         ids = groups.pop(0)
         after, changes = world, dict[str, tuple[ClaimChange, ...]]()

@@ -42,10 +42,6 @@ def newest_asked(
     return max((versions[word] for word in asked or ("",)), key=lambda version: version.rank)
 
 
-def same_version(version: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
-    return (version and version.rank) == (other and other.rank)
-
-
 def version_of_service(
     world: World, service: Service, applications: Iterable[str]
 ) -> ApplicationVersion:
@@ -196,7 +192,8 @@ def affected_keys(
         is_moved = False
         if subject.kind is SubjectKind.APPLICATION and old and new:
             versions = (running_version(world, subject.id) for world in (before, after))
-            is_moved = not old.has_same_definition_and_nodes(new) or not same_version(*versions)
+            ranks = {version and version.rank for version in versions}
+            is_moved = not old.has_same_definition_and_nodes(new) or len(ranks) > 1
         for world, claim in zip((before, after), claims, strict=True):
             affected = [claim] if claim and world.ledger.get(claim.key) else []
             if is_moved:
