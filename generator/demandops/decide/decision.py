@@ -26,8 +26,8 @@ from demandops.decide.admission.completing import (
 )
 from demandops.decide.booking import Drain, apply
 from demandops.decide.changeset import Changeset, FileReader, PlannedChange, ReleaseChange
-from demandops.decide.checks import collisions, quotas, version_difference
-from demandops.decide.checks.version_difference import Difference
+from demandops.decide.checks import collisions, forbidden
+from demandops.decide.checks.forbidden import Difference
 from demandops.decide.placement import capacity, placement, relocation
 from demandops.decide.placement.candidates import NO_ROOM
 from demandops.decide.placement.capacity import Need
@@ -332,9 +332,9 @@ def _booked(
         changes = replace(changes, claims=claim_changes(state.ledger, ledger, idle))
     after = replace(state, ledger=ledger)
     checkpoint()
-    refusals = list(quotas.denial_faults(request, after, changes))
+    refusals = list(forbidden.denial_faults(request, after, changes))
     checkpoint()
-    refusals = refusals or list(quotas.quota_faults(state, after, changes))
+    refusals = refusals or list(forbidden.quota_faults(state, after, changes))
     if refusals:
         raise Refused(refusals)
     # overrides may keep what the request releases
@@ -357,9 +357,7 @@ def _booked(
     # a service whose node is to be chosen later has no release yet
     chosen = [key for key in keys if isinstance(key, ClientKey) or key.node]
     planned = changeset.plan_change(state, after, changes, chosen, read, state.plans, checkpoint)
-    differing = list(
-        version_difference.differences(request, state, after, changes.claims, planned.plans)
-    )
+    differing = [*forbidden.differences(request, state, after, changes.claims, planned.plans)]
     if refused := [difference.fault for difference in differing if difference.is_refused]:
         raise Refused(refused)
     grown = capacity.growth(planned.former, planned.plans, state.config)
@@ -459,4 +457,4 @@ def notes_on(
         yield from request.stays
     if isinstance(request, Wait):
         yield from request.reasons
-    yield from quotas.warnings(request, after)
+    yield from forbidden.warnings(request, after)

@@ -14,7 +14,7 @@ from demandops.base.quoting import quoted
 from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
 from demandops.decide.booking import Drain, conflicts
-from demandops.decide.checks import collisions, quotas
+from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.collisions import Names
 from demandops.decide.placement import candidates, capacity
 from demandops.decide.placement.candidates import Choice, Chosen, Room
@@ -328,7 +328,7 @@ def _faults(
         override = overrides.suspended_by(claim, after)
         if override and change.before and not overrides.suspended_by(change.before, before):
             yield Fault("denied", "", f"{claim.subject} would be denied by {override.path}")
-    yield from quotas.quota_faults(before, after, Changes(changes))
+    yield from forbidden.quota_faults(before, after, Changes(changes))
     for change in changes:
         if change.after:
             yield from collisions.faults_of_claim(change.after, before, after)

@@ -23,7 +23,7 @@ from demandops.model.release import ServiceKey
 # A claim on an application asks for a named version, or for the default version. A service that
 # several applications share has the newest of the versions of these applications. So the order of
 # the claims does not matter, and two demands that renew in turn do not restart the pods again and
-# again. :mod:`.version_difference` decides whether a demand may ask for another version than the
+# again. :mod:`.forbidden` decides whether a demand may ask for another version than the
 # existing demands.
 
 
