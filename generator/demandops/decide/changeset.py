@@ -54,10 +54,6 @@ class ReleaseChange:
     change: Change
     details: tuple[str, ...] = ()
 
-    @property
-    def order(self) -> tuple[int, str]:
-        return CHANGE_ORDER.index(self.change), self.name
-
 
 @dataclass(frozen=True, slots=True)
 class PlannedChange:
@@ -161,7 +157,7 @@ def render_change(
         if old or new:
             releases.append(describe_change(old, new, current is not None))
     _refuse_large(files, config.repo_settings.limits.file_bytes, read)
-    releases.sort(key=lambda change: change.order)
+    releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
 
 
@@ -505,7 +501,7 @@ def preview(
                     facts.append(f"and {len(differing) - _MOST_FACTS} more")
                 change = replace(change, details=tuple(facts))
         releases.append(change)
-    releases.sort(key=lambda change: change.order)
+    releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
     others = tuple(sorted(changed - of_releases))
     return MergePreview(tuple(releases), file_changes, others)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby, islice, takewhile
 
 from demandops.base.errors import MOST_FAULTS, Fault, fault, suggestion
@@ -191,11 +191,11 @@ def _named_topics(held: Application | Connection) -> list[tuple[str, str]]:
     return [(key.sender, key.topic) for key in map(held.key_of, held.topics)]
 
 
+@dataclass(slots=True)
 class _KnownTopics:
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._listed: dict[str, set[str]] = {}
-        self._told: set[tuple[str, str]] = set()
+    config: Config
+    _listed: dict[str, set[str]] = field(default_factory=dict)
+    _told: set[tuple[str, str]] = field(default_factory=set)
 
     def notes_on(
         self,
@@ -209,7 +209,7 @@ class _KnownTopics:
         what = "application" if isinstance(held, Application) else "connection"
         for node, topic in _named_topics(held):
             if node not in self._listed:
-                entry = self._config.nodes.get(node)
+                entry = self.config.nodes.get(node)
                 own = {*entry.topics.values(), *entry.types} if entry else set[str]()
                 self._listed[node] = own.union(*entry.bridged.values()) if entry else own
             listed, booked = self._listed[node], earlier(node, topic)
@@ -250,12 +250,12 @@ def _common(text: str, other: str) -> int:
 
 def ignored_field_warnings(config: Config) -> Iterator[Fault]:
     for path, text in sorted(config.files.items()):
-        for field in ignored_fields(path, text):
+        for ignored in ignored_fields(path, text):
             message = (
                 "is ignored, because replicas follow demand at once; remove it, or run `demandops "
                 "upgrade`, which does so"
             )
-            yield fault(field, message).within(path)
+            yield fault(ignored, message).within(path)
 
 
 # ---- warnings about patterns of the policy that match nothing now ----
@@ -269,7 +269,7 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
     for name, domain in sorted(config.domains.items()):
         own = tuple(sorted(id for id, of in config.domain_of.items() if of.name == name))
         others = tuple(sorted(config.domains.keys() - {name}))
-        # (field, patterns, what the patterns may match, all names that they may match)
+        # (where, patterns, what the patterns may match, all names that they may match)
         kinds = [("nodes", domain.nodes, "node", nodes)]
         for rule in domain.rules:
             place = f"rule '{rule.name}'"
@@ -281,12 +281,12 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
                 (f"{place}: peers", rule.peers, "other access domain", others),
             ]
         file = config.file_of(DOMAINS_FILE, name)
-        for field, patterns, what, names in kinds:
+        for where, patterns, what, names in kinds:
             for pattern in patterns:
                 if pattern != "*" and not any(matches(each, (pattern,)) for each in names):
                     hint = suggestion(pattern, names) or "; there is none"
                     message = f"{quoted(pattern)} matches no {what}{hint}"
-                    yield fault(f"access domain '{name}', {field}", message).within(file)
+                    yield fault(f"access domain '{name}', {where}", message).within(file)
 
 
 # ---- warnings about access domains, nodes and requirements, which ``demandops check`` shows ----
