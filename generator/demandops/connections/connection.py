@@ -434,7 +434,6 @@ class ConnectionType(ABC):
         return ""
 
     def derived_id(self, key: RouteKey) -> str:
-        """Return the id of the derived connection that carries a route."""
         ends = f"derived/{key.sender}/{key.receiver}"
         if not self.one_derived_route:
             return ends

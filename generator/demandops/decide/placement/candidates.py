@@ -240,7 +240,6 @@ class Choice:
         ]
 
     def _rank(self) -> Callable[[Node], tuple[bool, float, float, str]]:
-        """Return the order of nodes, as a key to sort by."""
         positions, order = self.positions, self.config.repo_settings.placement
         # the middle of the sources whose position is known
         sources = sorted({topic.source for _, topic in self.app.all_inputs()})

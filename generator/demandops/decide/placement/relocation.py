@@ -219,18 +219,6 @@ def _moved(
     return _Move(after, followed, changes, grown)
 
 
-def _brought_twice(change: ClaimChange, ledger: Ledger) -> Iterator[Fault]:
-    if change.after is None or change.after.is_on_application:
-        return
-    former = change.before.connection.topics if change.before else ()
-    held = ledger.claims_of_demand(change.key.demand)
-    apps = [claim.application for claim in held if claim.is_on_application]
-    connection = change.after.connection
-    for index, words in carriers.chosen_twice(connection, apps, ledger):
-        if connection.topics[index] not in former:
-            yield Fault("conflict", "", words)
-
-
 @dataclass(frozen=True, slots=True)
 class LedgerUpdate:
     """The ledger after a change of overrides or claims, and the ledger files to write.
@@ -330,8 +318,15 @@ def _faults(
             yield Fault("denied", "", f"{claim.subject} would be denied by {override.path}")
     yield from forbidden.quota_faults(before, after, Changes(changes))
     for change in changes:
-        if change.after:
-            yield from collisions.faults_of_claim(change.after, before, after)
-            yield from _brought_twice(change, after.ledger)
+        if not (claim := change.after):
+            continue
+        yield from collisions.faults_of_claim(claim, before, after)
+        if not claim.is_on_application:
+            former = change.before.connection.topics if change.before else ()
+            held = after.ledger.claims_of_demand(claim.demand)
+            apps = [each.application for each in held if each.is_on_application]
+            for index, words in carriers.chosen_twice(claim.connection, apps, after.ledger):
+                if claim.connection.topics[index] not in former:
+                    yield Fault("conflict", "", words)
     keys = affected_keys(before, after, changes)
     yield from collisions.name_faults(Demand("drain"), before, after, keys, Changes(changes), names)
