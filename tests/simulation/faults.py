@@ -17,7 +17,7 @@ from demandops.connections import connection
 from demandops.connections.connection import ConnectionType, Route
 from demandops.decide import booking, changeset, decision, edits
 from demandops.decide.admission import completing, permission
-from demandops.decide.checks import quotas
+from demandops.decide.checks import forbidden
 from demandops.decide.decision import Decision
 from demandops.decide.placement import capacity, placement
 from demandops.decide.placement.candidates import Choice
@@ -102,7 +102,7 @@ plant("let_strangers_change_a_demand", 1, permission, "stranger_faults", lambda 
 plant("release_only_the_first_claim", 64, booking, "claims_of", first_only)
 plant("replace_what_was_joined", 2, Claim, "extending", itself)
 plant("commit_what_is_booked_already", 8, Claim, "after_booking", itself)
-plant("grant_one_claim_too_many", 4, quotas, "_held", lambda held, *given: held(*given) - 1)
+plant("grant_one_claim_too_many", 4, forbidden, "_held", lambda held, *given: held(*given) - 1)
 
 
 @wrong(16, booking, "shut_down")
@@ -227,7 +227,7 @@ plant("leave_drained_nodes_full", 8, Draining, "is_due", nothing)
 plant("leave_drained_nodes_full", 8, Draining, "move_due", nothing)
 plant("place_on_drained_nodes", 1, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 5, placement, "_booked", nothing)
-plant("count_no_room", 2, capacity, "exceeded", lambda *_: [])
+plant("count_no_room", 2, capacity, "excesses", lambda *_: [])
 
 
 @wrong(1, Usage, "plus")
@@ -261,7 +261,7 @@ def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bo
 
 plant("run_what_is_denied", 26, planner, "without_suspended", itself)
 plant("run_what_is_denied", 26, release_keys, "without_suspended", itself)
-plant("book_what_is_denied", 27, quotas, "denial_faults", lambda *_: ())
+plant("book_what_is_denied", 27, forbidden, "denial_faults", lambda *_: ())
 
 
 @wrong(1, edits, "expired_overrides")

@@ -86,9 +86,6 @@ class Route:
         listed = ", ".join(f"{name} {value}" for name, value in options.items())
         return f"topic {self.source} {direction} {self.target}" + (f" ({listed})" if listed else "")
 
-    def sender_and_receiver(self, source: str, target: str) -> tuple[str, str]:
-        return (target, source) if self.reverse else (source, target)
-
 
 _DEFAULTS = tuple(
     (item.name, item.default)
@@ -220,11 +217,6 @@ class Connection:
     def nodes(self) -> tuple[str, str]:
         return (self.source, self.target)
 
-    @property
-    def known_type(self) -> ConnectionType:
-        assert self.type is not None, self.id  # noqa: S101 - the callers know that one is chosen
-        return self.type
-
     def route(self, source: str) -> Route | None:
         """Return the route of a source topic; the routes must be sorted, as those of a claim."""
         place = bisect_left(self.topics, source, key=attrgetter("source"))
@@ -232,7 +224,7 @@ class Connection:
         return candidate[0] if candidate and candidate[0].source == source else None
 
     def key_of(self, route: Route) -> RouteKey:
-        sender, receiver = route.sender_and_receiver(self.source, self.target)
+        sender, receiver = reversed(self.nodes) if route.reverse else self.nodes
         return RouteKey(sender, route.read_topic, receiver, route.written_topic)
 
     def route_of(self, key: RouteKey) -> Route | None:  # the routes must be sorted
@@ -437,17 +429,11 @@ class ConnectionType(ABC):
         # those that only this type can find; `where` is the route's path in the connection
         return iter(())
 
-    def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        # as clients will carry it, and a note of how it differs; it may have faults, because the
-        # generator checks it only after this call
-        return connection, ""
-
     def broker_node(self, connection: Connection, config: Config) -> str:
         # the node of the broker at which the clients will meet, if they need one
         return ""
 
     def derived_id(self, key: RouteKey) -> str:
-        """Return the id of the derived connection that carries a route."""
         ends = f"derived/{key.sender}/{key.receiver}"
         if not self.one_derived_route:
             return ends

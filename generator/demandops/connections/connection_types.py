@@ -10,7 +10,7 @@ from pydantic_core import PydanticKnownError
 
 from demandops.base.errors import Fault, fault, sentences
 from demandops.base.naming import topic_problem
-from demandops.connections.connection import UNSUPPORTED, Connection, ConnectionType, Route
+from demandops.connections.connection import UNSUPPORTED, Connection, ConnectionType
 from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
 from demandops.connections.zenoh import ZENOH
@@ -94,7 +94,7 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
                 )
                 yield fault(end, message, code=UNSUPPORTED)
     yield from kind.link_faults(connection, config)
-    yield from route_faults(kind, connection.topics, (connection.source, connection.target), config)
+    yield from route_faults(kind, connection, config)
 
 
 def broker_fault(field: str, kind: ConnectionType) -> Fault:
@@ -103,10 +103,8 @@ def broker_fault(field: str, kind: ConnectionType) -> Fault:
     return fault(field, message)
 
 
-def route_faults(
-    kind: ConnectionType, topics: Iterable[Route], ends: tuple[str, str], config: Config
-) -> Iterator[Fault]:
-    for index, route in enumerate(topics):
+def route_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
+    for index, route in enumerate(connection.topics):
         if topic_problem(route.source) or topic_problem(route.target):
             continue  # the checks of the request report this topic
         where = f"topics[{index}]"
@@ -118,7 +116,7 @@ def route_faults(
                     f"{name} of '{route.source}' is not supported by {kind.name}; leave it out, or "
                     f"use type {able}",
                 )
-        yield from kind.route_faults(where, route, route.sender_and_receiver(*ends)[0], config)
+        yield from kind.route_faults(where, route, connection.key_of(route).sender, config)
         if route.source != route.target and not kind.renames:
             able = listed(other for other in CONNECTION_TYPES if other.renames)
             yield fault(

@@ -74,16 +74,6 @@ class Mqtt(ConnectionType):
             )
             yield fault(f"{where}.type", message, code=routes.UNSUPPORTED)
 
-    def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        broker = choose_broker(connection, config)
-        if not connection.broker or broker is None or broker.node == connection.broker:
-            return connection, ""
-        note = (
-            f"uses the broker on '{broker.node}', because {config.place_of(configs.BROKERS_FILE)} "
-            f"has none on {quoted(connection.broker)}"
-        )
-        return replace(connection, broker=broker.node), note
-
     def broker_node(self, connection: Connection, config: Config) -> str:
         broker = choose_broker(connection, config)
         return broker.node if broker else ""

@@ -59,12 +59,10 @@ class Ros(ConnectionType):
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None
-        ends = (connection.source, connection.target)
+        sent = ((route, connection.key_of(route).sender) for route in connection.topics)
         typed = tuple(
-            replace(
-                route, type=routes.message_type(route, route.sender_and_receiver(*ends)[0], config)
-            )
-            for route in connection.topics
+            replace(route, type=routes.message_type(route, sender, config))
+            for route, sender in sent
         )
         listener = _listener(connection, config)
         if listener is None or listener.wan is None:

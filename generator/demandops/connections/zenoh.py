@@ -76,10 +76,10 @@ class Zenoh(routes.ConnectionType):
             connection = connections.get(id)
             if connection is None or not connection.topics:
                 continue
-            ends = connection.source, connection.target
-            peers[id] = ends[1] if key.id == ends[0] else ends[0]
+            source, target = connection.nodes
+            peers[id] = target if key.id == source else source
             for route in connection.topics:
-                if key.id != route.sender_and_receiver(*ends)[0]:
+                if key.id != connection.key_of(route).sender:
                     subscribers.add(route.written_topic)
                     continue
                 rate, other = publishers.setdefault(route.read_topic, (route.rate, id))

@@ -50,12 +50,14 @@ def claims_of(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
 def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fault]:
     """Yield the faults of an item that contradicts claims, or with ``above`` earlier items."""
     held = item.held
+    against = f"contradicts {'an item above' if above else 'an existing claim'}"
+    by = "listed for" if above else "held by"
     if isinstance(held, Application):
         # all claims on an application agree about its node and type, so the first speaks for all
         first = ledger.first_claim(held.subject)
         if first is None:
             return
-        booked = first.application
+        booked, holders = first.application, ", ".join(first.requesters)
         wait = "" if above else ", or wait until the application is released"
         for name, new, current, holding, remedy in (
             ("node", held.node, booked.node, "on", f"request node '{booked.node}'{wait}"),
@@ -63,7 +65,7 @@ def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fa
         ):
             if new != current:
                 message = (
-                    f"'{new}' {_contradicts(above)}: {_held(first, above)} {holding} '{current}'; "
+                    f"'{new}' {against}: '{held.id}' is {by} {holders} {holding} '{current}'; "
                     f"{remedy}"
                 )
                 yield item.fault(name, message, code="conflict")
@@ -71,44 +73,35 @@ def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fa
         return
     told = set[str]()  # a contradiction with several claims is told once
     for claim in ledger.connection_claims(held.id):
+        holding = f"'{held.id}' is {by} {', '.join(claim.requesters)}"
         for name, new, current in (
             ("source", held.source, claim.connection.source),
             ("target", held.target, claim.connection.target),
         ):
             if new != current:
                 message = (
-                    f"'{new}' {_contradicts(above)}: {_held(claim, above)} with {name} "
-                    f"'{current}'; use the same {name}, or another connection id"
+                    f"'{new}' {against}: {holding} with {name} '{current}'; use the same {name}, "
+                    "or another connection id"
                 )
                 yield item.fault(name, message, code="conflict")
                 return
-        for each in _route_conflicts(item, held, claim, above):
+        for each in _route_conflicts(item, held, claim.connection, against, holding):
             if each.field not in told:
                 told.add(each.field)
                 yield each
 
 
-def _contradicts(above: bool) -> str:
-    return f"contradicts {'an item above' if above else 'an existing claim'}"
-
-
-def _held(claim: Claim, above: bool) -> str:
-    holders = ", ".join(claim.requesters)
-    return f"'{claim.held.id}' is {'listed for' if above else 'held by'} {holders}"
-
-
 def _route_conflicts(
-    item: Item, demanded: Connection, claim: Claim, above: bool
+    item: Item, demanded: Connection, booked: Connection, against: str, holding: str
 ) -> Iterator[Fault]:
-    held = _held(claim, above)
-    by_source = {route.source: route for route in claim.connection.topics}
-    carried_back = {route.target: route for route in claim.connection.topics if route.reverse}
+    by_source = {route.source: route for route in booked.topics}
+    carried_back = {route.target: route for route in booked.topics if route.reverse}
     for index, route in enumerate(demanded.topics):
         where, current = f"topics[{index}]", by_source.get(route.source)
         if current is None:
             if route.reverse and (other := carried_back.get(route.target)):
                 message = (
-                    f"connection {held} and already carries '{route.target}' back to "
+                    f"connection {holding} and already carries '{route.target}' back to "
                     f"'{other.source}'; a connection carries a target topic back to only one "
                     "source topic, so use a second connection"
                 )
@@ -116,15 +109,15 @@ def _route_conflicts(
             continue
         if current.target != route.target:
             message = (
-                f"connection {held} and already carries '{route.source}' to '{current.target}'; a "
-                "connection carries a source topic to only one target topic, so use a second "
-                "connection"
+                f"connection {holding} and already carries '{route.source}' to "
+                f"'{current.target}'; a connection carries a source topic to only one target "
+                "topic, so use a second connection"
             )
             yield item.fault(f"{where}.target", message, code="conflict")
         for name, old, new in routes.contradictions(current, route):
             message = (
-                f"{name} {new} of '{route.source}' {_contradicts(above)}: {held} with "
-                f"{name} {old}; use the same {name}"
+                f"{name} {new} of '{route.source}' {against}: {holding} with {name} {old}; use the "
+                f"same {name}"
             )
             yield item.fault(f"{where}.{name}", message, code="conflict")
 

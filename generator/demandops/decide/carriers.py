@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from operator import attrgetter
 
 from demandops.base.naming import SubjectKind, TopicKey, hash_of, id_problem, topic_problem
 from demandops.base.quoting import quoted
@@ -41,7 +42,7 @@ def with_implied_routes(request: AnyDemand, ledger: Ledger, config: Config) -> A
         app = item.held
         if not isinstance(app, Application) or (app.connect.type == "none" and not app.held_for):
             continue
-        demand = _demand_of(request, item)
+        demand = request.demand or demand_id(request.id, item.requesters)
         places: dict[TopicKey, str] = {
             (role, topic.topic, topic.source): f"inputs.{role}[{index}]"
             for role, topics in app.inputs.items()
@@ -85,14 +86,13 @@ def _implied(flow: Flow, connect: Connect, route: Route) -> Connection:
     return Connection("", kind, flow.sender, flow.receiver, broker, (route,))
 
 
-def _demand_of(request: Demand, item: Item) -> str:
-    return request.demand or demand_id(request.id, item.requesters)
+_ORDER = attrgetter("subject.id", "demand")  # of the keys of claims
 
 
+@dataclass(slots=True)
 class _StandingRoutes:
-    def __init__(self, ledger: Ledger) -> None:
-        self._ledger = ledger
-        self._by_target: dict[ClaimKey, dict[tuple[str, str], list[Route]]] = {}
+    ledger: Ledger
+    _by_target: dict[ClaimKey, dict[tuple[str, str], list[Route]]] = field(default_factory=dict)
 
     def serving(self, flow: Flow, request: Demand, demand: str) -> tuple[Claim, Route] | None:
         """Return the claim and route that bring an input already, perhaps by another source name.
@@ -102,8 +102,8 @@ class _StandingRoutes:
         """
         is_join = request.operation == "join"
         same = RouteKey(flow.sender, flow.topic, flow.receiver, flow.target)
-        bringing = self._ledger.keys_with("brings", flow.receiver, flow.target)
-        exact = sorted(self._ledger.keys_with("route", *same), key=_order)[:1]
+        bringing = self.ledger.keys_with("brings", flow.receiver, flow.target)
+        exact = sorted(self.ledger.keys_with("route", *same), key=_ORDER)[:1]
         # thousands of claims may bring a topic, mostly by this very route
         others = bringing if not exact else ()
         for holders in ([each for each in bringing if each.demand == demand], exact, others):
@@ -114,7 +114,7 @@ class _StandingRoutes:
                 # from another node, only an earlier goal of the demand itself brings it
                 if key.sender != flow.sender and not (is_join and was_listed):
                     continue
-                if key.topic != flow.topic and (flow.is_output or flow.delivery is not None):
+                if key.topic != flow.topic and ("." in flow.name or flow.delivery is not None):
                     continue
                 # a put gives up what it listed and lists no longer
                 if key.topic != flow.topic and was_listed and not is_join:
@@ -126,7 +126,7 @@ class _StandingRoutes:
         return None
 
     def _bringing(self, holders: Iterable[ClaimKey], flow: Flow) -> Iterator[tuple[Claim, Route]]:
-        for claim in filter(None, map(self._ledger.get, sorted(holders, key=_order))):
+        for claim in filter(None, map(self.ledger.get, sorted(holders, key=_ORDER))):
             if claim.key not in self._by_target:
                 routes: dict[tuple[str, str], list[Route]] = {}
                 for route in claim.connection.topics:
@@ -135,10 +135,6 @@ class _StandingRoutes:
                 self._by_target[claim.key] = routes
             for route in self._by_target[claim.key].get((flow.receiver, flow.target), ()):
                 yield claim, route
-
-
-def _order(key: ClaimKey) -> tuple[str, str]:
-    return key.subject.id, key.demand
 
 
 # ---- carriers: each route of a demand gets its connection ----
@@ -157,7 +153,14 @@ def with_carriers(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDema
     carriers = _Carriers(request, ledger, config)
     for item in request.demanded:
         listed = item.held
-        if isinstance(listed, Connection) and listed.topics and _is_well_formed(item, listed):
+        # admission refuses what is not well formed, wherever its routes could go
+        if (
+            isinstance(listed, Connection)
+            and listed.topics
+            and not (item.is_listed and id_problem(listed.id))
+            and not (listed.broker and id_problem(listed.broker))
+            and not any(faults("topics", listed.topics))
+        ):
             for index, route in enumerate(listed.topics):
                 carriers.place(item, listed, index, route)
         else:
@@ -166,28 +169,26 @@ def with_carriers(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDema
     return replace(request, demanded=tuple(carriers.united()), notes=notes)
 
 
-def _is_well_formed(item: Item, listed: Connection) -> bool:
-    # admission refuses what is not, wherever its routes could go
-    ids = [listed.id] * item.is_listed + [listed.broker] * bool(listed.broker)
-    return not any(map(id_problem, ids)) and not any(faults("topics", listed.topics))
-
-
+@dataclass(slots=True)
 class _Carriers:
     """What the routes of a request are carried by; each is placed after those before it."""
 
-    def __init__(self, request: Demand, ledger: Ledger, config: Config) -> None:
-        self._request, self._ledger, self._config = request, ledger, config
-        self._is_put = request.operation == "put"
-        self.notes: list[str] = []
-        # The items in their order. A key stands for all that a demand has on one connection: that
-        # connection without topics, and the demand.
-        self.items: list[Item | tuple[Connection, str]] = []
-        self._routes: dict[tuple[Connection, str], list[tuple[Item, str, Route]]] = {}
-        self._above: dict[RouteKey, tuple[Connection, Route]] = {}
-        self._standing: dict[str, Connection] = {}
+    _request: Demand
+    _ledger: Ledger
+    _config: Config
+    notes: list[str] = field(default_factory=list)
+    # The items in their order. A key stands for all that a demand has on one connection: that
+    # connection without topics, and the demand.
+    items: list[Item | tuple[Connection, str]] = field(default_factory=list)
+    _routes: dict[tuple[Connection, str], list[tuple[Item, str, Route]]] = field(
+        default_factory=dict
+    )
+    _above: dict[RouteKey, tuple[Connection, Route]] = field(default_factory=dict)
+    _standing: dict[str, Connection] = field(default_factory=dict)
 
     def place(self, item: Item, listed: Connection, index: int, route: Route) -> None:
-        key, demand = listed.key_of(route), _demand_of(self._request, item)
+        key, request = listed.key_of(route), self._request
+        demand = request.demand or demand_id(request.id, item.requesters)
         carried = self._carried(key, demand)
         if carried is None and is_bridged(key, self._config):
             self.notes.append(
@@ -230,7 +231,7 @@ class _Carriers:
             return self._above[key]
         if not own and is_bridged(key, self._config):
             return None
-        for each in sorted(own or holding, key=_order)[:1]:
+        for each in sorted(own or holding, key=_ORDER)[:1]:
             claim = self._ledger.get(each)
             route = claim.connection.route_of(key) if claim else None
             if claim and route:
@@ -244,7 +245,7 @@ class _Carriers:
                 claim.connection
                 for claim in self._ledger.connection_claims(id)
                 # a put may change what it alone holds
-                if not (self._is_put and claim.demand == self._request.demand)
+                if self._request.operation != "put" or claim.demand != self._request.demand
             ]
             if not held:
                 return None
@@ -394,7 +395,8 @@ def with_moved_routes(world: World, claim: Claim, moved: Application) -> Ledger:
             # as it was carried before the move, perhaps under another name at its source
             source = like[1].read_topic
             route = replace(like[1], source=source, target=flow.target, reverse=False, listed="")
-            connect = Connect(like[0].known_type.word, like[0].broker)
+            kind = like[0].type
+            connect = Connect(kind.word if kind else "auto", like[0].broker)
         items.append(Item(_implied(flow, connect, route), claim.requesters, is_listed=False))
     operation: Operation = "join" if claim.joined else "put"
     put = Demand(operation, claim.request, tuple(items), claim.demand)

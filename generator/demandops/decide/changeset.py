@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Any, Literal
@@ -54,10 +54,6 @@ class ReleaseChange:
     change: Change
     details: tuple[str, ...] = ()
 
-    @property
-    def order(self) -> tuple[int, str]:
-        return CHANGE_ORDER.index(self.change), self.name
-
 
 @dataclass(frozen=True, slots=True)
 class PlannedChange:
@@ -96,7 +92,14 @@ def plan_change(
     ``keys`` are those of the releases that may differ, and ``plans`` are releases of ``before``
     that are planned already. ``checkpoint`` may raise an exception to end the work.
     """
-    files = _ledger_files(after.ledger, changes, checkpoint)
+    files: dict[str, str | None] = {}
+    for change in changes.claims:
+        checkpoint()
+        path = claim_files.path_of(change.key)
+        files[path] = claim_files.text_of(change.after) if change.after else None
+    for demand in changes.waiting:
+        waits = after.ledger.waiting.get(demand)
+        files[records.waiting_path(demand)] = records.waiting_text(waits) if waits else None
     # before anything is planned, because a claim's file is the smallest of the files that need it
     _refuse_large(files, after.config.repo_settings.limits.file_bytes, read)
     now, former = dict[ReleaseKey, Release | None](), dict[ReleaseKey, Release | None]()
@@ -154,22 +157,8 @@ def render_change(
         if old or new:
             releases.append(describe_change(old, new, current is not None))
     _refuse_large(files, config.repo_settings.limits.file_bytes, read)
-    releases.sort(key=lambda change: change.order)
+    releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
-
-
-def _ledger_files(
-    ledger: Ledger, changes: Changes, checkpoint: Callable[[], None]
-) -> dict[str, str | None]:
-    files: dict[str, str | None] = {}
-    for change in changes.claims:
-        checkpoint()
-        path = claim_files.path_of(change.key)
-        files[path] = claim_files.text_of(change.after) if change.after else None
-    for demand in changes.waiting:
-        waits = ledger.waiting.get(demand)
-        files[records.waiting_path(demand)] = records.waiting_text(waits) if waits else None
-    return files
 
 
 def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
@@ -214,22 +203,23 @@ def render_all(
     return files | gitops.kept_charts(files, current, world)
 
 
+@dataclass(slots=True)
 class _Texts:
     """The texts of releases. A template that took too long for one is not tried for others."""
 
-    def __init__(self, config: Config, evaluate: Evaluate) -> None:
-        self._config, self._evaluate = config, evaluate
-        self._late: dict[str, OverLimit] = {}
-        self._used: dict[tuple[str, str], bool] = {}  # by template and parameter
+    config: Config
+    evaluate: Evaluate
+    _late: dict[str, OverLimit] = field(default_factory=dict)
+    _used: dict[tuple[str, str], bool] = field(default_factory=dict)  # by template and parameter
 
     def text_of(self, release: Release, current: str | None) -> str:
         template = ""
         if isinstance(release, ServiceRelease):
-            template = self._config.values_template(release.service)
+            template = self.config.values_template(release.service)
         if template in self._late:
             raise self._late[template]
         try:
-            return gitops.release_text(release, self._config, self._evaluate, current)
+            return gitops.release_text(release, self.config, self.evaluate, current)
         except OverLimit as error:
             self._late[template] = error
             raise
@@ -239,7 +229,7 @@ class _Texts:
         # that leaves the file as it is with its old value is no part of the change.
         if not isinstance(old, ServiceRelease) or not isinstance(new, ServiceRelease):
             return old
-        template, unused = self._config.values_template(new.service), dict[str, object]()
+        template, unused = self.config.values_template(new.service), dict[str, object]()
         for name, value in new.parameters.items():
             if new.shaping.held or old.parameters.get(name, value) == value:
                 continue
@@ -261,7 +251,12 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
     kind: Change = "stop" if not new else "change" if existed else "start"
     details: list[str] = []
     if new and existed:
-        before, after = _overrides(old), _overrides(new)
+        before, after = (
+            [f"{override.path}: {', '.join(effects)}" for override, effects in side.shaping.by]
+            if side
+            else []
+            for side in (old, new)
+        )
         if not new.shaping.held:  # in a held file, only the comments that name overrides change
             before = (old.facts() if old else []) + before
             after = new.facts() + after
@@ -269,11 +264,6 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
         details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
         details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
     return ReleaseChange(release.name, release.description, path_of(release), kind, tuple(details))
-
-
-def _overrides(release: Release | None) -> list[str]:
-    by = release.shaping.by if release is not None else ()
-    return [f"{override.path}: {', '.join(effects)}" for override, effects in by]
 
 
 # ---- trial demands: a new configuration must render before real demands arrive ----
@@ -511,7 +501,7 @@ def preview(
                     facts.append(f"and {len(differing) - _MOST_FACTS} more")
                 change = replace(change, details=tuple(facts))
         releases.append(change)
-    releases.sort(key=lambda change: change.order)
+    releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
     others = tuple(sorted(changed - of_releases))
     return MergePreview(tuple(releases), file_changes, others)
 

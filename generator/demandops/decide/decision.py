@@ -20,20 +20,18 @@ from demandops.decide import carriers, changeset, rollback, warnings
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.completing import (
     completed,
-    notes_on_instances,
     prepared,
     with_definitions,
     with_separate_instances,
 )
 from demandops.decide.booking import Drain, apply
 from demandops.decide.changeset import Changeset, FileReader, PlannedChange, ReleaseChange
-from demandops.decide.checks import collisions, quotas, version_difference
-from demandops.decide.checks.version_difference import Difference
+from demandops.decide.checks import collisions, forbidden
+from demandops.decide.checks.forbidden import Difference
 from demandops.decide.placement import capacity, placement, relocation
 from demandops.decide.placement.candidates import NO_ROOM
 from demandops.decide.placement.capacity import Need
-from demandops.decide.planning import chains
-from demandops.decide.planning.flows import flows_without_carrier
+from demandops.decide.planning.flows import flows_without_carrier, without_idle_holds
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.rollback import Restoration
@@ -41,6 +39,7 @@ from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Application, Demand
 from demandops.model.demand.goals import goal_field, read_goal
+from demandops.model.ledger.claim import demand_id
 from demandops.model.ledger.ledger import Changes, World, claim_changes, ledger_of
 from demandops.model.ledger.records import Wait, WaitingDemand
 
@@ -111,6 +110,7 @@ class Decision:
 Throttle = Callable[[Demand, Config], Iterable[Fault]]
 # Is called often during a decision, and raises OverBudget to end it.
 Checkpoint = Callable[[], None]
+_NO_LIMIT: Checkpoint = lambda: None  # noqa: E731
 
 
 def decide(
@@ -120,7 +120,7 @@ def decide(
     read: FileReader,
     on_stage: Callable[[Stage], None] = lambda stage: None,
     throttle: Throttle = lambda demand, config: (),
-    checkpoint: Checkpoint = lambda: None,
+    checkpoint: Checkpoint = _NO_LIMIT,
 ) -> Decision:
     """Return the decision on a demand, or on its goal as plain data.
 
@@ -145,7 +145,7 @@ def decide(
     demand = read_goal(goal, state.config.repo_settings.limits)
     # what was booked must be released, however long that takes
     if demand.is_complete or not demand.adds_claims:
-        checkpoint = _no_limit
+        checkpoint = _NO_LIMIT
     tell = cache(on_stage)  # once for each stage, because there may be several attempts
 
     def throttled(request: Demand) -> Demand:
@@ -183,10 +183,6 @@ class _TooSoon(Exception):
 
     def __init__(self, faults: tuple[Fault, ...]) -> None:
         self.faults = faults
-
-
-def _no_limit() -> None:
-    pass
 
 
 def _refused(state: State, demand: Demand, faults: Iterable[Fault]) -> Refused:
@@ -231,8 +227,8 @@ def admit(state: State, demand: Demand) -> Demand:
     return _searched(
         state,
         demand,
-        lambda request, faults: admitted(request, state, faults, _no_limit),
-        _no_limit,
+        lambda request, faults: admitted(request, state, faults, _NO_LIMIT),
+        _NO_LIMIT,
     )
 
 
@@ -331,16 +327,16 @@ def _booked(
         ledger = ledger.without(ledger.kept_claims(subject))
     ledger, changes = apply(ledger, request, now)
     if not isinstance(request, Restoration):
-        ledger, idle = chains.without_idle_holds(ledger, changes.claims)
+        ledger, idle = without_idle_holds(ledger, changes.claims)
         ends = [*idle, *(change.key for change in changes.claims)]
         ended = claim_changes(state.ledger, ledger, ends)
         ledger, routes = carriers.without_idle_routes(ledger, state.config, ended)
         changes = replace(changes, claims=claim_changes(state.ledger, ledger, [*routes, *ends]))
     after = replace(state, ledger=ledger)
     checkpoint()
-    refusals = list(quotas.denial_faults(request, after, changes))
+    refusals = list(forbidden.denial_faults(request, after, changes))
     checkpoint()
-    refusals = refusals or list(quotas.quota_faults(state, after, changes))
+    refusals = refusals or list(forbidden.quota_faults(state, after, changes))
     if refusals:
         raise Refused(refusals)
     # overrides may keep what the request releases
@@ -363,9 +359,7 @@ def _booked(
     # a service whose node is to be chosen later has no release yet
     chosen = [key for key in keys if isinstance(key, ClientKey) or key.node]
     planned = changeset.plan_change(state, after, changes, chosen, read, state.plans, checkpoint)
-    differing = list(
-        version_difference.differences(request, state, after, changes.claims, planned.plans)
-    )
+    differing = [*forbidden.differences(request, state, after, changes.claims, planned.plans)]
     if refused := [difference.fault for difference in differing if difference.is_refused]:
         raise Refused(refused)
     grown = capacity.growth(planned.former, planned.plans, state.config)
@@ -435,7 +429,10 @@ def _once(*texts: str) -> tuple[str, ...]:
 def notes_on(
     request: Demand, before: World, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
-    yield from notes_on_instances(request)
+    for item in request.demanded:
+        if isinstance(item.held, Application) and item.held.separate:
+            id, _, version = item.held.id.rpartition("@")
+            yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"
     # a connection that an override denies carries nothing
     ledger = without_suspended(after).ledger
     for item in request.demanded if request.adds_claims else ():
@@ -453,11 +450,13 @@ def notes_on(
                 if change.after.connection.topics[index] not in former:
                     yield f"{words}; a subscriber gets the messages of both"
     yield from warnings.notes(request, before)
-    yield from warnings.unheld_output_notes(request, after)
+    for item in request.demanded if request.adds_claims else ():
+        demand = request.demand or demand_id(request.id, item.requesters)
+        yield from warnings.unheld_outputs(item.held, demand, after)
     yield from warnings.lost_output_notes(changes, after)
     yield from rendered.blocked
     if isinstance(request, Drain):
         yield from request.stays
     if isinstance(request, Wait):
         yield from request.reasons
-    yield from quotas.warnings(request, after)
+    yield from forbidden.warnings(request, after)

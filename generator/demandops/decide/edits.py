@@ -13,7 +13,7 @@ from demandops.base.naming import Subject
 from demandops.decide import changeset, rollback
 from demandops.decide.admission import admission, permission
 from demandops.decide.changeset import Changeset, FileReader
-from demandops.decide.checks import collisions, quotas
+from demandops.decide.checks import collisions, forbidden
 from demandops.decide.placement import capacity
 from demandops.decide.placement.capacity import NoRoom
 from demandops.decide.placement.relocation import LedgerUpdate, following_overrides
@@ -56,7 +56,7 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
         malformed = list(admission.faults(wanted, config))
         allowed = chain(
             permission.faults(wanted, config),
-            quotas.quota_faults(before, after, Changes((change,))),
+            forbidden.quota_faults(before, after, Changes((change,))),
         )
         for each in malformed or allowed:
             yield each.within(claim_files.path_of(claim.key))
@@ -109,9 +109,10 @@ def update_ledger(
     ended |= {each.name: format_time(each.end) for each in expired if each.end}
     files: dict[str, str | None] = dict.fromkeys(stale)
     for override in expired:
-        files |= _marker(override)
+        path = records.ended_override_path(override.name)
+        files[path] = records.ended_override_text(override)
     after = replace(after, ledger=replace(after.ledger, ended=ended))
-    kept = (*overrides.kept_subjects(before.ledger), *overrides.kept_subjects(after.ledger))
+    kept = [c.subject for ledger in (before.ledger, after.ledger) for c in ledger.kept_claims()]
     update = update_claims(before.ledger, after, dict.fromkeys((*subjects, *kept)), now)
     moved = following_overrides(replace(after, ledger=update.ledger))
     keys = (*update.keys, *moved.keys)
@@ -136,11 +137,8 @@ def end_override(world: World, override: Override, now: datetime) -> LedgerUpdat
     ended = {**world.ledger.ended, override.name: format_time(override.end)}
     after = replace(world, ledger=replace(world.ledger, ended=ended))
     update = update_ledger(world, after, (), {}, now)
-    return replace(update, files={**update.files, **_marker(override)})
-
-
-def _marker(override: Override) -> dict[str, str]:
-    return {records.ended_override_path(override.name): records.ended_override_text(override)}
+    marker = {records.ended_override_path(override.name): records.ended_override_text(override)}
+    return replace(update, files={**update.files, **marker})
 
 
 def changed_claim_files(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -52,23 +52,24 @@ class State(World):
         state = replace(self, ledger=ledger)
         object.__setattr__(state, "plans", plans)
         object.__setattr__(state, "_usage", usage)
-        state._follow_names(self, planned.plans.keys())
+        if self._names is not None:
+            names = collisions.followed(self._names, self, state, planned.plans.keys())
+            object.__setattr__(state, "_names", names)
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
         state, changes = replace(self, ledger=ledger), tuple(changes)
-        with suppress(Refused):  # if a definition is gone; then ``names`` looks at all releases
-            state._follow_names(self, affected_keys(self, state, changes))
-        if self._usage is not None:
-            with suppress(Refused):  # if a definition is gone; then ``usage`` counts all services
+        # If a definition is gone, ``names`` and ``usage`` look at all releases again.
+        with suppress(Refused):
+            if self._names is not None:
+                keys = affected_keys(self, state, changes)
+                names = collisions.followed(self._names, self, state, keys)
+                object.__setattr__(state, "_names", names)
+        with suppress(Refused):
+            if self._usage is not None:
                 usage = self._usage.plus(capacity.growth_by(self, state, changes))
                 object.__setattr__(state, "_usage", usage)
         return state
-
-    def _follow_names(self, before: State, keys: Collection[ReleaseKey]) -> None:
-        if before._names is not None:
-            names = collisions.followed(before._names, before, self, keys)
-            object.__setattr__(self, "_names", names)
 
 
 def rendered_files(

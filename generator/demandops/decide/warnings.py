@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import groupby, islice, takewhile
 
 from demandops.base.errors import MOST_FAULTS, Fault, fault, suggestion
@@ -25,7 +25,7 @@ from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.policy import AccessDomain, matches
 from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import ClaimKey, demand_id
+from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import Changes, World
 from demandops.templating import charts
 
@@ -93,17 +93,11 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
 
 def unheld_output_warnings(world: World) -> Iterator[Fault]:
     for claim in sorted(world.ledger, key=lambda claim: claim_files.path_of(claim.key)):
-        for note in _unheld_outputs(claim.held, claim.demand, world):
+        for note in unheld_outputs(claim.held, claim.demand, world):
             yield fault("", note).within(claim_files.path_of(claim.key))
 
 
-def unheld_output_notes(request: Demand, after: World) -> Iterator[str]:
-    for item in request.demanded if request.adds_claims else ():
-        demand = request.demand or demand_id(request.id, item.requesters)
-        yield from _unheld_outputs(item.held, demand, after)
-
-
-def _unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
+def unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
     if not isinstance(held, Application) or held.held_for:
         return
     services = (each for services in world.config.services.values() for each in services.values())
@@ -196,15 +190,14 @@ def misspelled_topic_warnings(world: World) -> Iterator[Fault]:
 def _named_topics(held: Application | Connection) -> list[tuple[str, str]]:
     if isinstance(held, Application):
         return [(topic.source, topic.topic) for _, topic in held.all_inputs()]
-    ends = held.source, held.target
-    return [(route.sender_and_receiver(*ends)[0], route.read_topic) for route in held.topics]
+    return [(key.sender, key.topic) for key in map(held.key_of, held.topics)]
 
 
+@dataclass(slots=True)
 class _KnownTopics:
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._listed: dict[str, frozenset[str]] = {}
-        self._told: set[tuple[str, str]] = set()
+    config: Config
+    _listed: dict[str, set[str]] = field(default_factory=dict)
+    _told: set[tuple[str, str]] = field(default_factory=set)
 
     def notes_on(
         self,
@@ -217,7 +210,11 @@ class _KnownTopics:
         """
         what = "application" if isinstance(held, Application) else "connection"
         for node, topic in _named_topics(held):
-            listed, booked = self._of(node), earlier(node, topic)
+            if node not in self._listed:
+                entry = self.config.nodes.get(node)
+                own = {*entry.topics.values(), *entry.types} if entry else set[str]()
+                self._listed[node] = own.union(*entry.bridged.values()) if entry else own
+            listed, booked = self._listed[node], earlier(node, topic)
             if (node, topic) in self._told or topic in listed or topic in booked:
                 continue
             near = [each for each in (*listed, *booked) if _is_misspelling(topic, each)]
@@ -225,15 +222,6 @@ class _KnownTopics:
                 self._told.add((node, topic))
                 meant = f"did you mean '{min(near)}'?"
                 yield f"{what} '{held.id}': '{node}' is not known to publish {topic}; {meant}"
-
-    def _of(self, node: str) -> frozenset[str]:
-        if node not in self._listed:
-            entry = self._config.nodes.get(node)
-            topics = set[str]()
-            if entry:
-                topics = {*entry.topics.values(), *entry.types}.union(*entry.bridged.values())
-            self._listed[node] = frozenset(topics)
-        return self._listed[node]
 
 
 def _is_misspelling(topic: str, other: str) -> bool:
@@ -264,12 +252,12 @@ def _common(text: str, other: str) -> int:
 
 def ignored_field_warnings(config: Config) -> Iterator[Fault]:
     for path, text in sorted(config.files.items()):
-        for field in ignored_fields(path, text):
+        for ignored in ignored_fields(path, text):
             message = (
                 "is ignored, because replicas follow demand at once; remove it, or run `demandops "
                 "upgrade`, which does so"
             )
-            yield fault(field, message).within(path)
+            yield fault(ignored, message).within(path)
 
 
 # ---- warnings about patterns of the policy that match nothing now ----
@@ -283,7 +271,7 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
     for name, domain in sorted(config.domains.items()):
         own = tuple(sorted(id for id, of in config.domain_of.items() if of.name == name))
         others = tuple(sorted(config.domains.keys() - {name}))
-        # (field, patterns, what the patterns may match, all names that they may match)
+        # (where, patterns, what the patterns may match, all names that they may match)
         kinds = [("nodes", domain.nodes, "node", nodes)]
         for rule in domain.rules:
             place = f"rule '{rule.name}'"
@@ -295,12 +283,12 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
                 (f"{place}: peers", rule.peers, "other access domain", others),
             ]
         file = config.file_of(DOMAINS_FILE, name)
-        for field, patterns, what, names in kinds:
+        for where, patterns, what, names in kinds:
             for pattern in patterns:
                 if pattern != "*" and not any(matches(each, (pattern,)) for each in names):
                     hint = suggestion(pattern, names) or "; there is none"
                     message = f"{quoted(pattern)} matches no {what}{hint}"
-                    yield fault(f"access domain '{name}', {field}", message).within(file)
+                    yield fault(f"access domain '{name}', {where}", message).within(file)
 
 
 # ---- warnings about access domains, nodes and requirements, which ``demandops check`` shows ----

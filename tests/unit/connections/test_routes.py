@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from demandops.connections.connection import (
     ROUTE_OPTIONS,
+    Connection,
     Route,
     contradictions,
     merged_routes,
@@ -53,6 +54,7 @@ def test_a_type_that_is_not_said_contradicts_none_and_is_filled_in() -> None:
 def test_where_messages_come_from_and_arrive(
     reverse: bool, topics: tuple[str, str], nodes: tuple[str, str]
 ) -> None:
-    route = Route("/a", "/b", reverse=reverse)
-    assert (route.read_topic, route.written_topic) == topics
-    assert route.sender_and_receiver("s", "t") == nodes
+    connection = Connection(source="s", target="t", topics=(Route("/a", "/b", reverse=reverse),))
+    sender, read, receiver, written = connection.key_of(*connection.topics)
+    assert (read, written) == topics
+    assert (sender, receiver) == nodes

@@ -18,7 +18,7 @@ from demandops.connections import connection as routes
 from demandops.connections import connection_types
 from demandops.connections.connection import Connection
 from demandops.model.config.appdef import ApplicationDefinition, Services
-from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
+from demandops.model.config.config import BROKERS_FILE, DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.repo_settings import Limits
 from demandops.model.demand.demand import (
     LONGEST_S,
@@ -313,25 +313,23 @@ def with_chosen_types(
     if not request.adds_claims:
         return request
 
-    notes = list(request.notes)
-
-    def with_type(item: Item) -> Item:
+    notes, demanded = list(request.notes), list[Item]()
+    for item in request.demanded:
         connection = item.held
-        if not isinstance(connection, Connection):
-            return item
-        if connection.type is None:
+        if isinstance(connection, Connection) and connection.type is None:
             # A claimed connection keeps its type. Else a new broker or node property would change
             # the type that is chosen, and the request would contradict the other claims.
             claimed = current(connection.id)
             chosen = claimed.type if claimed else connection_types.choose_type(connection, config)
             connection = replace(connection, type=chosen)
-        if connection.type is None or id_problem(connection.broker or "none"):
-            return replace(item, held=connection)
-        # the type may use another broker than the request names; the note says so
-        connection, note = connection.type.settled(connection, config)
-        if note:
-            notes.append(f"connection '{connection.id}' {note}")
-        return replace(item, held=connection)
-
-    demanded = tuple(map(with_type, request.demanded))
-    return replace(request, demanded=demanded, notes=tuple(notes))
+        if isinstance(connection, Connection) and connection.type and connection.broker:
+            named = connection.broker
+            used = "" if id_problem(named) else connection.type.broker_node(connection, config)
+            if used not in ("", named):
+                notes.append(
+                    f"connection '{connection.id}' uses the broker on '{used}', because "
+                    f"{config.place_of(BROKERS_FILE)} has none on {quoted(named)}"
+                )
+                connection = replace(connection, broker=used)
+        demanded.append(replace(item, held=connection))
+    return replace(request, demanded=tuple(demanded), notes=tuple(notes))

@@ -10,7 +10,7 @@ from demandops.connections.connection import Connection
 from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
-from demandops.decide.planning import chains
+from demandops.decide.planning import flows
 from demandops.decide.planning.overrides import with_overridden_nodes
 from demandops.decide.state import State
 from demandops.model.config.config import Config
@@ -19,7 +19,6 @@ from demandops.model.demand.demand import (
     AnyDemand,
     Application,
     Decommission,
-    Demand,
     Held,
     InputTopic,
     Item,
@@ -36,7 +35,7 @@ def prepared(demand: AnyDemand, state: State) -> tuple[AnyDemand, list[Fault]]:
     # the id of a separate instance comes first, because the placement looks for claims on it
     demand = with_separate_instances(demand, config)
     demand, unclear = with_chosen_domains(demand, config, ledger)
-    demand, unread = chains.with_topics_of_outputs(demand, ledger, config)
+    demand, unread = flows.with_topics_of_outputs(demand, ledger, config)
     return demand, [*unclear, *unread]
 
 
@@ -44,14 +43,21 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
     """Return a prepared demand, whose nodes are chosen, with all else that the generator adds."""
     config, ledger = state.config, state.ledger
     if demand.adds_claims:
-        moved = (
-            replace(item, held=_with_moved_services(item.held, state)) for item in demand.demanded
-        )
-        demand = replace(demand, demanded=tuple(moved))
-    if chains.reads_outputs(demand):
+        demanded = list(demand.demanded)
+        for index, item in enumerate(demanded):
+            if isinstance(app := item.held, Application):
+                # The moved services of a booked application stay on the booked nodes. Only a change
+                # of an override or of a definition moves them again, and not a further demand.
+                booked = ledger.application(app.id)
+                moved = replace(app, moved=booked.moved) if booked else app
+                if booked is None or not moved.has_same_definition_and_nodes(booked):
+                    moved = with_overridden_nodes(app, state)
+                demanded[index] = replace(item, held=moved)
+        demand = replace(demand, demanded=tuple(demanded))
+    if flows.reads_outputs(demand):
         # again, because the nodes of listed applications may have been open
-        demand, _ = chains.with_topics_of_outputs(demand, ledger, config)
-        demand = chains.with_held_applications(demand, ledger, config)
+        demand, _ = flows.with_topics_of_outputs(demand, ledger, config)
+        demand = flows.with_held_applications(demand, ledger, config)
     demand = carriers.with_implied_routes(demand, ledger, config)
     checkpoint()
     # before what depends on the connection: its lease, type, permission, quota and approval
@@ -67,27 +73,15 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
 def _without_impossible_routes(demand: AnyDemand, config: Config) -> AnyDemand:
     # A client of the reference does not ask for the connections that it does not list, and gets a
     # warning where there can be none.
-    def is_possible(item: Item) -> bool:
-        held = item.held
-        if not isinstance(held, Connection) or not all(route.implied for route in held.topics):
-            return True
-        alone = replace(demand, demanded=(item,))
-        faults = (*admission.faults(alone, config), *permission.faults(alone, config))
-        return not held.topics or not faults
-
-    return replace(demand, demanded=tuple(filter(is_possible, demand.demanded)))
-
-
-def _with_moved_services(held: Held, state: State) -> Held:
-    if not isinstance(held, Application):
-        return held
-    # The moved services of a booked application stay on the booked nodes. Only a change of an
-    # override or of a definition moves them again, and not a further demand.
-    booked = state.ledger.application(held.id)
-    moved = replace(held, moved=booked.moved) if booked else held
-    if booked is None or not moved.has_same_definition_and_nodes(booked):
-        moved = with_overridden_nodes(held, state)
-    return moved
+    possible = []
+    for item in demand.demanded:
+        topics = item.held.topics if isinstance(item.held, Connection) else ()
+        if topics and all(route.implied for route in topics):
+            alone = replace(demand, demanded=(item,))
+            if [*admission.faults(alone, config), *permission.faults(alone, config)]:
+                continue
+        possible.append(item)
+    return replace(demand, demanded=tuple(possible))
 
 
 # ---- the definition that a goal of the reference's action means by a number ----
@@ -97,23 +91,21 @@ def with_definitions(demand: AnyDemand, config: Config) -> AnyDemand:
     if not demand.is_reference:
         return demand
 
-    def defined(held: Held) -> Held:
-        if not isinstance(held, Application) or not held.appdef.startswith("#"):
-            return held
-        number = held.appdef.removeprefix("#")
+    demanded = list(demand.demanded)
+    for index, item in enumerate(demanded):
+        number = item.held.appdef.removeprefix("#") if isinstance(item.held, Application) else ""
+        if not isinstance(item.held, Application) or number == item.held.appdef:
+            continue
         appdef = config.appdef_by_wire_type(int(number)) if number.isdecimal() else None
-        if appdef is None:
-            return held
-        wire = appdef.deployment_request
-        roles = {str(name): role for name, role in wire.inputs.items()} if wire else {}
+        if appdef is None or (wire := appdef.deployment_request) is None:
+            continue
+        roles = {str(name): role for name, role in wire.inputs.items()}
         inputs: dict[str, tuple[InputTopic, ...]] = {}
-        for name, topics in held.inputs.items():  # the definition may give both lists to one role
+        for name, topics in item.held.inputs.items():  # both lists may be of one role
             role = roles.get(name) or name
             inputs[role] = (*inputs.get(role, ()), *topics)
-        return replace(held, appdef=appdef.name, inputs=inputs)
-
-    demanded = tuple(replace(item, held=defined(item.held)) for item in demand.demanded)
-    return replace(demand, demanded=demanded)
+        demanded[index] = replace(item, held=replace(item.held, appdef=appdef.name, inputs=inputs))
+    return replace(demand, demanded=tuple(demanded))
 
 
 # ---- the choice of an access domain if a demand names a node that is in several domains ----
@@ -238,10 +230,3 @@ def _separated(app: Application, config: Config) -> Application:
     suffix = f"@{version.name}"
     id = app.id if app.id.endswith(suffix) else f"{app.id}{suffix}"
     return replace(app, id=id, version=version.name, separate=True)
-
-
-def notes_on_instances(request: Demand) -> Iterator[str]:
-    for item in request.demanded:
-        if isinstance(item.held, Application) and item.held.separate:
-            id, _, version = item.held.id.rpartition("@")
-            yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"

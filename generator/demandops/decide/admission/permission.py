@@ -32,7 +32,7 @@ _NO_RULES = (Rule(name="everything"),)
 def faults(request: Demand, config: Config) -> Iterator[Fault]:
     if not request.adds_claims:  # everybody may release what is theirs
         return
-    lease_s = _wanted_lease(request)
+    lease_s = request.lease_s
     for item in request.demanded:
         for domain, access in needed_access(item.held, config):
             yield from _not_allowed(item, domain, access)
@@ -166,11 +166,9 @@ def stranger_faults(
 
 
 def with_lease_terms(request: AnyDemand, config: Config) -> AnyDemand:
-    def with_term(item: Item) -> Item:
-        domain = config.domain_of.get(item.held.home)
-        return replace(item, term=term(request, domain) if domain else None)
-
-    return replace(request, demanded=tuple(map(with_term, request.demanded)))
+    homes = [(item, config.domain_of.get(item.held.home)) for item in request.demanded]
+    demanded = [replace(item, term=term(request, home) if home else None) for item, home in homes]
+    return replace(request, demanded=tuple(demanded))
 
 
 def term(request: Demand, domain: AccessDomain) -> Term | None:
@@ -179,12 +177,8 @@ def term(request: Demand, domain: AccessDomain) -> Term | None:
     if request.is_reference and not policy.deployment_requests:
         return None
     given = policy.default or policy.longest
-    seconds = _wanted_lease(request) or (seconds_of(given) if given else None)
+    seconds = request.lease_s or (seconds_of(given) if given else None)
     return Term(seconds, seconds_of(policy.slack)) if seconds else None
-
-
-def _wanted_lease(request: Demand) -> int | None:
-    return request.lease_s
 
 
 def approval_reasons(

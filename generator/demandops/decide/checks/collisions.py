@@ -56,8 +56,7 @@ def topic_faults(
                 message = f"{both}; choose another node"
                 yield item.fault(f"topics[{index}]", message, code="conflict")
         for index, route in enumerate(connection.topics):
-            _, node = route.sender_and_receiver(*connection.nodes)
-            topic = route.written_topic
+            _, _, node, topic = connection.key_of(route)
             if connection.id in before.ledger.ids_with("brings", node, topic):
                 continue
             # Only services that run before and after the demand count. If an application moves, a

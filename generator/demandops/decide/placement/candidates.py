@@ -154,7 +154,8 @@ class Choice:
                 skipped["that its requesters may use"] = None
                 continue
             merit = f"the one with the {'most' if order == 'pack' else 'fewest'} applications"
-            if self._is_home(node):
+            # a service on its application's node needs no connection to it
+            if self.service is not None and node.id == self.app.node:
                 merit = "the node of its application"
             elif order == "nearest" and rank(node)[1] < inf:
                 merit = "the nearest to its sources"
@@ -208,7 +209,7 @@ class Choice:
     def _is_full(self, node: Node) -> bool:
         if node.capacity is None or node.id in self.room.given_back:
             return False
-        return any(capacity.exceeded(self.room.usage, self._growth(node.id), self.config))
+        return any(capacity.excesses(self.room.usage, self._growth(node.id), self.config))
 
     def _shortage(self, node: Node) -> list[str]:
         """Return, in words, each resource of which a node has too little; empty if it has room."""
@@ -238,12 +239,7 @@ class Choice:
             and not (more and any(lacks(node, required)))
         ]
 
-    def _is_home(self, node: Node) -> bool:
-        # A service on its application's node needs no connection to it.
-        return self.service is not None and node.id == self.app.node
-
     def _rank(self) -> Callable[[Node], tuple[bool, float, float, str]]:
-        """Return the order of nodes, as a key to sort by."""
         positions, order = self.positions, self.config.repo_settings.placement
         # the middle of the sources whose position is known
         sources = sorted({topic.source for _, topic in self.app.all_inputs()})

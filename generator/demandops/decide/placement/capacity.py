@@ -93,23 +93,17 @@ def requests(plans: Plans, config: Config) -> Counter[Need]:
     return total
 
 
-def exceeded(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[Need, int]]:
-    """Yield (need, capacity) for each resource of which a node has too little for the growth."""
-    for need, amount in grown.items():
-        node = config.nodes.get(need[0])
-        most = node.most(need[1]) if node else None
-        # Only growth is refused. If a person lowers a capacity below what is used, no demand is
-        # stopped that adds nothing there.
-        if most is not None and amount > 0 and usage.of(*need) + amount > most:
-            yield need, most
-
-
 def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
     """Yield (node, reason) for each resource of which a node has too little for the growth."""
-    for need, most in sorted(exceeded(usage, grown, config)):
-        resource, left = need[1], max(most - usage.of(*need), 0)
-        free, capacity, asked = (amount_text(n, resource) for n in (left, most, grown[need]))
-        yield need[0], f"has {free} of {capacity} {resource} free, but {asked} is asked for"
+    for (id, resource), amount in sorted(grown.items()):
+        node, used = config.nodes.get(id), usage.of(id, resource)
+        most = node.most(resource) if node else None
+        # Only growth is refused. If a person lowers a capacity below what is used, no demand is
+        # stopped that adds nothing there.
+        if most is not None and amount > 0 and used + amount > most:
+            left = max(most - used, 0)
+            free, capacity, asked = (amount_text(n, resource) for n in (left, most, amount))
+            yield id, f"has {free} of {capacity} {resource} free, but {asked} is asked for"
 
 
 class NoRoom(Refused):

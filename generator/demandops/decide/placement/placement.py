@@ -66,7 +66,16 @@ def search(
 
     ``checkpoint`` is called at each step; it may raise an exception to end the search.
     """
-    if not request.adds_claims or not _needs_placement(request, state):
+    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
+    # A service with a node of its own, in the request or in the ledger, needs its node checked.
+    is_open = any(
+        app.place
+        or app.services
+        or _services_to_place(app, state)
+        or ((booked := state.ledger.application(app.id)) and booked.services)
+        for app in apps
+    )
+    if not request.adds_claims or not is_open:
         return attempt(request, ())
     places = _Places(request, state, attempt, checkpoint)
     placed, faults = places.placed()
@@ -88,18 +97,6 @@ def search(
     except Refused as refusal:
         lacks_room = isinstance(first, NoRoom) and all(f.code == NO_ROOM for f in refusal.faults)
         raise refusal if lacks_room else first from None
-
-
-def _needs_placement(request: Demand, world: World) -> bool:
-    # A service with a node of its own, in the request or in the ledger, needs its node checked.
-    apps = (item.held for item in request.demanded if isinstance(item.held, Application))
-    return any(
-        app.place
-        or app.services
-        or _services_to_place(app, world)
-        or ((booked := world.ledger.application(app.id)) and booked.services)
-        for app in apps
-    )
 
 
 def _services_to_place(app: Application, world: World) -> list[Service]:

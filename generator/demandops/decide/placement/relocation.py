@@ -14,13 +14,13 @@ from demandops.base.quoting import quoted
 from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
 from demandops.decide.booking import Drain, conflicts
-from demandops.decide.checks import collisions, quotas
+from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.collisions import Names
 from demandops.decide.placement import candidates, capacity
 from demandops.decide.placement.candidates import Choice, Chosen, Room
 from demandops.decide.placement.capacity import Need, Usage
-from demandops.decide.planning import chains, overrides
-from demandops.decide.planning.flows import flows
+from demandops.decide.planning import overrides
+from demandops.decide.planning.flows import flows, with_booked_outputs
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.rollback import Restoration, request_for
 from demandops.model.config.appdef import Service
@@ -65,7 +65,9 @@ def with_moved(
     moved = dict.fromkeys(claim.subject.id for claim in claims)
     reading = [each.key for id in moved for each in ledger.claims_with("reads", id)]
     for reader in filter(None, (ledger.get(key) for key in reading if key not in done)):
-        follow = partial(chains.followed, demand=reader.demand, ledger=ledger, config=world.config)
+        follow = partial(
+            with_booked_outputs, demand=reader.demand, ledger=ledger, config=world.config
+        )
         if follow(reader.application) != reader.application:
             after, changes = with_moved(replace(world, ledger=ledger), [reader], follow, done)
             ledger, keys = after.ledger, [*keys, *(change.key for change in changes)]
@@ -217,18 +219,6 @@ def _moved(
     return _Move(after, followed, changes, grown)
 
 
-def _brought_twice(change: ClaimChange, ledger: Ledger) -> Iterator[Fault]:
-    if change.after is None or change.after.is_on_application:
-        return
-    former = change.before.connection.topics if change.before else ()
-    held = ledger.claims_of_demand(change.key.demand)
-    apps = [claim.application for claim in held if claim.is_on_application]
-    connection = change.after.connection
-    for index, words in carriers.chosen_twice(connection, apps, ledger):
-        if connection.topics[index] not in former:
-            yield Fault("conflict", "", words)
-
-
 @dataclass(frozen=True, slots=True)
 class LedgerUpdate:
     """The ledger after a change of overrides or claims, and the ledger files to write.
@@ -263,9 +253,8 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
     ]
     keys, stays = list[ClaimKey](), list[tuple[str, str]]()
     names = collisions.all_names(world) if moving else collisions.NONE
-    groups = (
-        [moving] if moving else []
-    )  # applications that share a service must move at the same time
+    # applications that share a service must move at the same time
+    groups = [moving] if moving else []
     while groups:
         ids = groups.pop(0)
         after, changes = world, dict[str, tuple[ClaimChange, ...]]()
@@ -327,10 +316,17 @@ def _faults(
         override = overrides.suspended_by(claim, after)
         if override and change.before and not overrides.suspended_by(change.before, before):
             yield Fault("denied", "", f"{claim.subject} would be denied by {override.path}")
-    yield from quotas.quota_faults(before, after, Changes(changes))
+    yield from forbidden.quota_faults(before, after, Changes(changes))
     for change in changes:
-        if change.after:
-            yield from collisions.faults_of_claim(change.after, before, after)
-            yield from _brought_twice(change, after.ledger)
+        if not (claim := change.after):
+            continue
+        yield from collisions.faults_of_claim(claim, before, after)
+        if not claim.is_on_application:
+            former = change.before.connection.topics if change.before else ()
+            held = after.ledger.claims_of_demand(claim.demand)
+            apps = [each.application for each in held if each.is_on_application]
+            for index, words in carriers.chosen_twice(claim.connection, apps, after.ledger):
+                if claim.connection.topics[index] not in former:
+                    yield Fault("conflict", "", words)
     keys = affected_keys(before, after, changes)
     yield from collisions.name_faults(Demand("drain"), before, after, keys, Changes(changes), names)

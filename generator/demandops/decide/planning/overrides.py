@@ -184,10 +184,6 @@ def update_kept_claims(
     return ledger, keys
 
 
-def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
-    return tuple(dict.fromkeys(claim.subject for claim in ledger.kept_claims()))
-
-
 def _kept_claim(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:

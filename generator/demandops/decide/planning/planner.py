@@ -10,7 +10,6 @@ import json
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TypeGuard
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import Refused, suggestion
@@ -66,16 +65,16 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     if not claims:
         return None
     apps = [claim.application for claim in claims]
-    service = release_keys.services_of(config, _as_claimed(world, apps[0]).appdef)[key.service]
+    first = world.ledger.application(apps[0].id) or apps[0]
+    service = release_keys.services_of(config, first.appdef)[key.service]
     node, domain = config.node_and_domain(key.node)
     parts = list(_parts(world, service, key, apps))
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for role in sorted(service.inputs):
-        read = {
-            published.topic
-            for part in parts
-            for published in topics_of_origin(config, part, _origin(config, key, role, part))
-        }
+        read = set[InputTopic]()
+        for part in parts:  # perhaps of several definitions, which share the service
+            origin = release_keys.services_of(config, part.appdef)[key.service].inputs[role]
+            read |= {made.topic for made in topics_of_origin(config, part, origin)}
         # Only some demands name the message type of a topic. An entry without the type sorts first,
         # so the entry with the type replaces it here.
         inputs[role] = tuple(
@@ -108,12 +107,6 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     )
 
 
-def _as_claimed(world: World, app: Application) -> Application:
-    # Claims on one application may differ if a person wrote one of them. Its first claim decides
-    # the appdef and the nodes, for all of them alike.
-    return world.ledger.application(app.id) or app
-
-
 def _parts(
     world: World, service: Service, key: ServiceKey, apps: Iterable[Application]
 ) -> Iterator[Application]:
@@ -129,7 +122,9 @@ def _parts(
         further = all(topic.further for topic in topics)
         shared = {service.root: (InputTopic(name, source, type, further),)}
     for same in claimed.values():
-        first = _as_claimed(world, same[0])
+        # Claims on one application may differ if a person wrote one of them. Its first claim
+        # decides the appdef and the nodes, for all of them alike.
+        first = world.ledger.application(same[0].id) or same[0]
         if shared:
             yield first.with_inputs(shared)
             if len(service.inputs) == 1:
@@ -147,16 +142,12 @@ def _parts(
         yield first.with_inputs({role: tuple(topics) for role, topics in inputs.items()})
 
 
-def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str:
-    return release_keys.services_of(config, app.appdef)[key.service].inputs[role]
-
-
 def demanded_inputs(
     world: World, release: ServiceRelease, app: Application
 ) -> Iterator[tuple[str, str]]:
     """Yield (role, topic) for each topic that a service reads for an application."""
     service, key = release.service, release.key
-    app = _as_claimed(world, app).with_inputs(app.inputs)
+    app = (world.ledger.application(app.id) or app).with_inputs(app.inputs)
     if service.roots:
         roots = {*roots_of(app, service, key)}
         inputs = {
@@ -164,9 +155,9 @@ def demanded_inputs(
             for role, topics in app.inputs.items()
         }
         app = app.with_inputs(inputs)
+    origins = release_keys.services_of(world.config, app.appdef)[key.service].inputs
     for role in service.inputs:
-        origin = _origin(world.config, key, role, app)
-        for published in topics_of_origin(world.config, app, origin):
+        for published in topics_of_origin(world.config, app, origins[role]):
             yield role, published.topic.topic
 
 
@@ -195,9 +186,11 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
         unique = {json.dumps(item, sort_keys=True): item for item in items}
         return [unique[text] for text in sorted(unique)]
     if parameter.merge in ("max", "min"):
-        numbers = [value for value in values if _is_number(value)]
+        numbers = list[int | float]()
         for value, claim in zip(values, claims, strict=True):
-            if _is_number(value):
+            # In Python a bool is an int, but the maximum of truth values has no meaning.
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                numbers.append(value)
                 continue
             message = (
                 f"{strict_yaml.short_repr(value)} for {', '.join(claim.requesters)} is not a "
@@ -221,11 +214,6 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
     return values[0]
 
 
-def _is_number(value: object) -> TypeGuard[int | float]:
-    # In Python a bool is an int, but the maximum of truth values has no meaning for a parameter.
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 @dataclass(frozen=True, slots=True)
 class _ClaimedConnections:
     world: World
@@ -243,16 +231,17 @@ class _ClaimedConnections:
             for route in connection_topics(claims)
             if not is_bridged(first.key_of(route), self.world.config)
         )
+        brokers = (claim.connection.broker for claim in claims)
+        united = replace(first, broker=next(filter(None, brokers), ""), topics=topics)
         # A person may have written a claim with a route that this type cannot carry, or have
         # removed from the inventory what the connection needs.
-        problems = list(route_faults(self.type, topics, first.nodes, self.world.config))
+        problems = list(route_faults(self.type, united, self.world.config))
         if problems:
             raise Refused(
                 replace(problem, field="connections", message=f"'{id}': {problem.message}")
                 for problem in problems
             )
-        brokers = (claim.connection.broker for claim in claims)
-        return replace(first, broker=next(filter(None, brokers), ""), topics=topics)
+        return united
 
 
 def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:

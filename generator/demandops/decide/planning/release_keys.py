@@ -23,7 +23,7 @@ from demandops.model.release import ServiceKey
 # A claim on an application asks for a named version, or for the default version. A service that
 # several applications share has the newest of the versions of these applications. So the order of
 # the claims does not matter, and two demands that renew in turn do not restart the pods again and
-# again. :mod:`.version_difference` decides whether a demand may ask for another version than the
+# again. :mod:`.forbidden` decides whether a demand may ask for another version than the
 # existing demands.
 
 
@@ -40,10 +40,6 @@ def newest_asked(
     """Return the newest of ``versions`` that claims on an application ask for, or the default."""
     asked = ledger.versions_asked(application, versions)
     return max((versions[word] for word in asked or ("",)), key=lambda version: version.rank)
-
-
-def same_version(version: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
-    return (version and version.rank) == (other and other.rank)
 
 
 def version_of_service(
@@ -108,7 +104,8 @@ def keys_of_claims(
     for claim in claims:
         if not claim.is_on_application:
             connection = world.ledger.connection(claim.subject.id) or claim.connection
-            keys |= dict.fromkeys(connection.known_type.keys(connection.id, *connection.nodes))
+            assert connection.type is not None, connection.id  # noqa: S101 - a claim has one
+            keys |= dict.fromkeys(connection.type.keys(connection.id, *connection.nodes))
             continue
         # The first claim on an application decides its appdef and nodes for all claims on it.
         first = world.ledger.application(claim.subject.id) or claim.application
@@ -195,7 +192,8 @@ def affected_keys(
         is_moved = False
         if subject.kind is SubjectKind.APPLICATION and old and new:
             versions = (running_version(world, subject.id) for world in (before, after))
-            is_moved = not old.has_same_definition_and_nodes(new) or not same_version(*versions)
+            ranks = {version and version.rank for version in versions}
+            is_moved = not old.has_same_definition_and_nodes(new) or len(ranks) > 1
         for world, claim in zip((before, after), claims, strict=True):
             affected = [claim] if claim and world.ledger.get(claim.key) else []
             if is_moved:

@@ -46,7 +46,7 @@ class InputTopic:
     """An input topic of an application, and the node that publishes it.
 
     A demand may instead name an ``output`` of an ``application``, as ``<service>.<output>`` or
-    without the service. The claim has them beside the topics that they meant (:mod:`.chains`).
+    without the service. The claim has them beside the topics that they meant (:mod:`.flows`).
     """
 
     __pydantic_config__: ClassVar = PART

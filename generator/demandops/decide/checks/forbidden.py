@@ -1,0 +1,362 @@
+"""Refuses a demand for what people forbid: by overrides, quotas and policies of versions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import islice
+
+from demandops.base.errors import Fault, fault
+from demandops.base.naming import Subject, SubjectKind
+from demandops.connections.connection import Connection
+from demandops.decide.planning import overrides, release_keys
+from demandops.decide.planning.overrides import Traits, fits, without_suspended
+from demandops.decide.planning.release_keys import (
+    ReleaseKey,
+    contents,
+    is_needed,
+    keys_of,
+    keys_of_claims,
+    newest_asked,
+)
+from demandops.model.config.appdef import VersionPolicy
+from demandops.model.config.config import Config
+from demandops.model.config.override import Selector, format_time
+from demandops.model.config.policy import AccessDomain, matches
+from demandops.model.config.registry import ApplicationVersion, precedence
+from demandops.model.demand.demand import Application, Demand, Item
+from demandops.model.ledger.claim import Claim
+from demandops.model.ledger.ledger import Changes, ClaimChange, World
+from demandops.model.release import Release, ServiceKey, ServiceRelease
+
+# ---- denials: a demand is refused if an override with ``deny`` selects what it asks for ----
+#
+# Such an override suspends existing claims that it selects. A demand that only repeats them is not
+# refused; its requester gets a warning.
+
+
+def denial_faults(request: Demand, after: World, changes: Changes) -> Iterator[Fault]:
+    denying = [override for override in reversed(after.overrides) if override.deny]
+    if not denying or not request.adds_claims:
+        return
+    renewed = {change.key.subject: change.only_renews for change in changes.claims}
+    for item in request.demanded:
+        if renewed.get(item.held.subject, True):
+            continue
+        # A selector that names services is compared with each service of the application, because
+        # a service may run on another node than the application. Any other is compared with the
+        # demand.
+        demanded, services = overrides.traits_of(item), list[Traits]()
+        if isinstance(item.held, Application):
+            services = [
+                replace(demanded, nodes=(key.node,), service=key.service)
+                for key in keys_of_claims(after, after.ledger.claims_on(item.held.subject))
+                if isinstance(key, ServiceKey)
+            ]
+        matching = (
+            (override, selector)
+            for override in denying
+            for selector in override.select
+            for traits in (services if selector.services else [demanded])
+            if fits(selector, traits, after.config)
+        )
+        for override, selector in islice(matching, 1):
+            until = f" until {format_time(override.end)}" if override.end else ""
+            carried = ""
+            if isinstance(item.held, Connection) and not item.is_listed:
+                route = item.held.topics[0]
+                what = f" of connection '{route.listed}'" if route.listed else ""
+                topic = item.held.key_of(route).topic
+                carried = f"{topic}{what} is carried by connection '{item.held.id}', which "
+            message = (
+                f"{carried}is denied by {override.path}{until}: {override.reason}; ask the "
+                f"override's owner, {override.owner}, or demand something else"
+            )
+            yield item.fault(_matched_field(selector, item, after.config), message, code="denied")
+
+
+def _matched_field(selector: Selector, item: Item, config: Config) -> str:
+    if selector.applications or selector.connections:
+        return "id"
+    if selector.requesters:
+        patterns = selector.requesters
+        index = next(i for i, name in enumerate(item.requesters) if matches(name, patterns))
+        return f"requesters[{index}]"
+    if selector.services or selector.appdefs:
+        return "type"
+    if isinstance(item.held, Application):
+        return "node"
+    source = item.held.source
+    at_source = not selector.nodes or matches(source, selector.nodes)
+    return "source" if at_source and overrides.has_labels(selector, source, config) else "target"
+
+
+def warnings(request: Demand, world: World) -> Iterator[str]:
+    """Yield a warning for each suspended claim of the requesters that a demand holds or lists."""
+    if not any(override.deny for override in world.overrides):
+        return
+    claims = [
+        *world.ledger.claims_of_demand(request.demand),
+        *(claim for subject in request.subjects() for claim in world.ledger.claims_on(subject)),
+    ]
+    seen = set()
+    requesters = set(request.requesters())
+    for claim in claims:
+        override = overrides.suspended_by(claim, world)
+        if override is None or claim.key in seen or not requesters & set(claim.requesters):
+            continue
+        seen.add(claim.key)
+        by = f"{override.path} of {override.owner}: {override.reason}"
+        yield f"{claim.subject} is suspended by {by}"
+
+
+# ---- quotas of an access domain: claims for each requester, and services on each node ----
+#
+# The quota ``demandsPerMinute`` is checked elsewhere (:mod:`.limits`).
+
+
+def quota_faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
+    """Yield a fault for each quota that the booking exceeds and whose count it raises.
+
+    Suspended claims count for ``claimsPerRequester``. Their services do not run, and so do not
+    count for ``servicesPerNode``.
+    """
+    domain_of = after.config.domain_of
+    booked = [change.after for change in changes.claims if change.after]
+    holders = {(claim.held.home, who) for claim in booked for who in claim.requesters}
+    domains = {
+        (domain.name, who): domain for node, who in holders if (domain := domain_of.get(node))
+    }
+    for (_, requester), domain in sorted(domains.items(), key=lambda pair: pair[0]):
+        most = domain.quotas.claims_per_requester
+        # The ledger has the count in all domains at hand. If even that fits, no search is needed.
+        if most is None or len(after.ledger.keys_with("requester", requester)) <= most:
+            continue
+        count = _held(requester, after, domain)
+        if count > most and count > _held(requester, before, domain):
+            usage = f"'{requester}' would hold {count} claims"
+            yield _exceeded(domain, "claimsPerRequester", most, usage)
+    touched = [claim for change in changes.claims if (claim := change.after or change.before)]
+    apps = [claim.application for claim in touched if claim.is_on_application]
+    nodes = {node for app in apps for node in app.needed_nodes()}
+    # A service that runs once for each cluster runs at the node that its definition names.
+    nodes |= {
+        service.runs_at[app.node]
+        for app in apps
+        for service in after.config.services.get(app.appdef, {}).values()
+        if app.node in service.runs_at
+    }
+    for node in sorted(nodes):
+        of_node = domain_of.get(node)
+        most = of_node.quotas.services_per_node if of_node else None
+        if of_node is None or most is None:
+            continue
+        count = _running(node, after)
+        if count > most and count > _running(node, before):
+            usage = f"'{node}' would run {count} services"
+            yield _exceeded(of_node, "servicesPerNode", most, usage)
+
+
+def _held(requester: str, world: World, domain: AccessDomain) -> int:
+    claims = world.ledger.claims_of_requester(requester)
+    return sum(world.config.domain_of.get(claim.held.home) is domain for claim in claims)
+
+
+def _running(node: str, world: World) -> int:
+    world = without_suspended(world)
+    ids = world.ledger.ids_with("node", node)
+    subjects = (Subject(SubjectKind.APPLICATION, id) for id in ids)
+    keys = {key for subject in subjects for key in keys_of(world, subject)}
+    for name, service in world.config.definitions.items():
+        key = ServiceKey(name, node, for_cluster=True)
+        if node in service.nodes.values() and is_needed(world, key):
+            keys.add(key)
+    return sum(isinstance(key, ServiceKey) and key.node == node for key in keys)
+
+
+def _exceeded(domain: AccessDomain, quota: str, most: int, usage: str) -> Fault:
+    return fault(
+        "",
+        f"{usage}, but quotas.{quota} of access domain '{domain.name}' allows {most}; release "
+        "something first, or ask for a change of policy/",
+        code="quota",
+    )
+
+
+# ---- version differences: demands ask for different versions of what they share ----
+#
+# The field ``versions`` of the application definition decides what happens. Either the demand is
+# refused, or the newest version is deployed. In some cases a person must approve the newest version
+# first.
+
+# From the strictest to the least strict.
+_STRICTNESS: tuple[VersionPolicy, ...] = ("refuse", "separate", "update", "upgrade")
+# With ``separate`` each version is an application of its own, so only shared services can differ.
+_REFUSING = ("refuse", "separate")
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A difference: demands ask for different versions of one application or service.
+
+    ``others`` is the newest version that the other demands ask for; ``newer`` tells whether
+    ``demanded`` is newer. ``policy`` is the value of ``versions`` in the definition ``appdef``. If
+    two definitions share the service, it is the stricter of their values.
+    """
+
+    what: str
+    appdef: str
+    policy: VersionPolicy
+    demanded: str
+    others: str
+    newer: bool
+    # To report if :attr:`is_refused`.
+    fault: Fault
+
+    def matters_to(self, asked: str) -> bool:
+        # A demand that names no version has an empty text for ``asked``.
+        return bool(asked) or self.newer or self.is_refused
+
+    @property
+    def is_refused(self) -> bool:
+        return self.policy in _REFUSING
+
+    def approval_reason(self) -> str:
+        """Return why a person must approve the difference, or ``""``; of no use if refused."""
+        # Another major version breaks what others get, in both directions. In 0.x, too, only the
+        # first number counts.
+        same_major = precedence(self.demanded)[0][0] == precedence(self.others)[0][0]
+        if self.policy == "upgrade" or same_major:
+            return ""
+        change = (
+            f"the upgrade of {self.what} from version {self.others} to {self.demanded}"
+            if self.newer
+            else f"version {self.demanded} of {self.what}, which runs in version {self.others}"
+        )
+        return f"application definition '{self.appdef}', for {change}"
+
+    def warning(self) -> str:
+        others = f"{self.what} runs version {self.others}, which others ask for"
+        return "" if self.newer else f"{others}, not {self.demanded}"
+
+
+def differences(
+    request: Demand,
+    before: World,
+    after: World,
+    changes: Iterable[ClaimChange],
+    plans: Mapping[ReleaseKey, Release | None],
+) -> Iterator[Difference]:
+    """Yield the differences between the versions that a demand and other demands ask for.
+
+    A difference that existed before the demand is left out, and so is one that does not matter to
+    it. ``plans`` are the releases that the demand may change, as they are after it.
+    """
+    if not request.adds_claims:
+        return
+    listed = {item.held.subject: item for item in request.demanded}
+    demanded: dict[str, tuple[Item, str]] = {}
+    for change in changes:
+        item, claim, old = listed.get(change.key.subject), change.after, change.before
+        if item is None or claim is None or not claim.is_on_application:
+            continue
+        demanded[claim.application.id] = item, claim.application.version
+        if old is None or old.application.version != claim.application.version:
+            yield from _of_application(item, claim, after)
+    for release in plans.values():
+        if isinstance(release, ServiceRelease) and len(release.applications) > 1:
+            yield from _of_service(release, demanded, before, without_suspended(after))
+
+
+def _of_application(item: Item, claim: Claim, after: World) -> Iterator[Difference]:
+    app, ledger = claim.application, after.ledger
+    versions = after.config.application_versions[app.appdef]
+    # Two words may name one version, for example a channel and a number.
+    if len({versions[word].rank for word in ledger.versions_asked(app.id, versions)}) < 2:
+        return
+    others = ledger.replace(claim.key, None)
+    own, theirs = versions.get(app.version, versions[""]), newest_asked(others, app.id, versions)
+    if own.rank == theirs.rank:
+        return
+    holders, held = "", ""
+    for other in others.claims_on(app.subject):
+        word = other.application.version
+        if versions.get(word, versions[""]).rank == theirs.rank:
+            holders, held = ", ".join(other.requesters), word if word in versions else ""
+            break
+    message = (
+        f"{_version_text(app.version, own)} contradicts an existing claim: '{app.id}' is held by "
+        f"{holders} in {_version_text(held, theirs)}; request that version, or use another "
+        "application id"
+    )
+    difference = Difference(
+        f"application '{app.id}'",
+        app.appdef,
+        after.config.appdefs[app.appdef].versions,
+        own.name,
+        theirs.name,
+        own.rank > theirs.rank,
+        item.fault("version", message, code="conflict"),
+    )
+    if difference.matters_to(app.version):
+        yield difference
+
+
+def _version_text(word: str, version: ApplicationVersion) -> str:
+    named = f"version '{word}'" if word else "the default version"
+    return f"{named} ({version.name})" if version.name not in ("", word) else named
+
+
+def _of_service(
+    release: ServiceRelease,
+    demanded: Mapping[str, tuple[Item, str]],
+    before: World,
+    after: World,
+) -> Iterator[Difference]:
+    """Yield the differences of demanded applications, each with the version it asks for."""
+    service, key, config = release.service, release.key, after.config
+    versions = {id: release_keys.running_version(after, id) for id in release.applications}
+    if len({contents(version, service) for version in versions.values() if version}) == 1:
+        return
+    for_what = f"for {key.topic} of '{key.source}'" if key.topic else f"on '{key.node}'"
+    what = f"{key.service} {for_what}"
+    for id, (item, asked) in demanded.items():
+        others = [other for other in versions if other != id]
+        own, theirs = versions.get(id), release_keys.version_of_service(after, service, others)
+        if own is None or contents(own, service) == contents(theirs, service):
+            continue
+        # The difference was there before the demand.
+        former = release_keys.running_version(before, id)
+        if (
+            former
+            and former.rank == own.rank
+            and any(
+                claim.application.id == id for claim in release_keys.claims_needing(before, key)
+            )
+        ):
+            continue
+        # Versions of two definitions have names of their own, so the charts are compared.
+        by_name = own.appdef == theirs.appdef and own.name
+        new, current = (
+            version.name if by_name else version.charts[service.chart].version
+            for version in (own, theirs)
+        )
+        remedy = f"version {current}" if by_name else f"a version that has {key.service} {current}"
+        sharing = ", ".join(f"'{other}'" for other in others[:3])
+        message = (
+            f"{what} would run in version {new}, but is shared with {sharing} in version "
+            f"{current}; request {remedy}"
+        )
+        appdefs = (config.appdefs[version.appdef] for version in (own, theirs))
+        strictest = min(appdefs, key=lambda appdef: _STRICTNESS.index(appdef.versions))
+        difference = Difference(
+            what,
+            strictest.name,
+            strictest.versions,
+            new,
+            current,
+            precedence(new) > precedence(current),
+            item.fault("version", message, code="conflict"),
+        )
+        if difference.matters_to(asked):
+            yield difference
