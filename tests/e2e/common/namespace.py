@@ -26,10 +26,15 @@ _OF_RELEASES = (
     *("Role", "RoleBinding", "ServiceAccount"),
 )
 _OTHERS = ("Job", "Service")
-_READY_POD = re.compile(r"pod of (?P<name>\S+?)(-[0-9a-f]{12})? on (?P<node>\S+), ready")
+_READY_POD = re.compile(
+    r"pod of (?P<name>mqtt-derived-\S+|\S+?)(-[0-9a-f]{12})? on (?P<node>\S+), ready"
+)
 
 Pods = set[tuple[str, str]]
-"""Pods, each as the name of its service without a hash, and its node."""
+"""Pods, each as the name of its service, and its node.
+
+The name has no hash, except for a client of a derived connection, whose topic may show only there.
+"""
 
 
 class Namespace:
