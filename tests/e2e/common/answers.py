@@ -105,7 +105,7 @@ def test_answered_when_it_is_healthy_and_when_it_is_gone(
     ) as held:
         names = {name_of(item) for item in domain.find("Deployment")}
         assert unavailable(domain) == []
-        assert {"od-edge-vehicle00"} < names and len(names) == 4
+        assert {"od-edge-vehicle00"} < names and len(names) == 6
         assert held.answer is not None and held.answer.reached == "healthy"
         assert stages[-2:] == ["reconciled", "healthy"]
         assert domain.applied() == held.commit
