@@ -392,3 +392,22 @@ def test_a_remote_that_does_not_answer_is_told(url: str, tmp_path: Path) -> None
             repository._run_git(repository._git, "ls-remote", place, timeout=0.2)
     message = str(repository.push_error(error.value))
     assert message == f"{url} cannot be pushed to: fatal: git timed out after 0.2 s"
+
+
+def test_a_damaged_file_fails_only_demands_that_read_it_and_is_named(bare: Path) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+    (path,) = [each for each in git(bare, "ls-tree", "-r", "--name-only", "main").split()
+               if "/of-" in each]  # fmt: skip
+    blob = git(bare, "rev-parse", f"main:{path}").strip()
+    packs = sorted((bare / "objects" / "pack").glob("*"))
+    for pack in packs:
+        shutil.move(pack, bare / pack.name)
+    for pack in sorted(bare.glob("*.pack")):
+        subprocess.run(["git", "unpack-objects", "-q"], cwd=bare, stdin=pack.open(), check=True)
+    (bare / "objects" / blob[:2] / blob[2:]).unlink()
+    with rig.running(bare) as generator:
+        reads, other = generator.submit(goal(6)), generator.submit(goal(2))  # 6 has the fusion of 1
+        with pytest.raises(StateRepoError, match=f"{path} of commit .* is missing or damaged"):
+            rig.receipt(reads)
+        assert rig.receipt(other).outcome == "booked"
