@@ -327,9 +327,10 @@ def brought_twice(connection: Connection, ledger: Ledger) -> Iterator[tuple[int,
         bringing = ledger.keys_with("brings", key.receiver, key.target)
         # thousands of claims may bring the topic, and mostly all by this route
         for holder in bringing if len(bringing) > len(holders) and not rivals else ():
-            claim = ledger.get(holder) if holder not in holders else None
-            for route in claim.connection.topics if claim else ():
-                other = claim.connection.key_of(route)  # type: ignore[union-attr]
+            if holder in holders or (claim := ledger.get(holder)) is None:
+                continue
+            for route in claim.connection.topics:
+                other = claim.connection.key_of(route)
                 if other[2:] == key[2:]:
                     rivals.append((other, holder.subject.id))
         if rivals:

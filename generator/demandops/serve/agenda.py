@@ -534,7 +534,7 @@ class RateLimit:
         return len(seen)
 
 
-# ---- the sign of life, for a supervisor such as a pod's liveness probe ----
+# ---- the heartbeat, which a supervisor such as a pod's liveness probe reads ----
 
 
 def heartbeat_in(file: Path | None) -> Callable[[], object]:

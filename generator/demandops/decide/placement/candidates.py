@@ -174,7 +174,7 @@ class Choice:
         return entry is not None and self.fits(node) and not self._is_full(entry)
 
     def take(self, node: str) -> None:
-        """Count the application or service on a node, for the choices that follow."""
+        """Add the application or service to the load of a node, as later choices see it."""
         self.room.usage = self.room.usage.plus(self._growth(node))
         self.room.started |= {replace(key, node=node) for key in self._starting or ()}
         self.room.placed[node] += 1
