@@ -53,7 +53,7 @@ def book(bare: Path, step: int) -> None:
 def branch(bare: Path, tmp_path: Path) -> Path:
     """A clone of the state repo, with a new branch `edit` checked out."""
     folder = tmp_path / "clone"
-    git(tmp_path, "clone", "--quiet", str(bare), str(folder))
+    git(tmp_path, "clone", "--quiet", "--no-local", str(bare), str(folder))
     git(folder, "checkout", "--quiet", "-b", "edit")
     return folder
 

@@ -138,7 +138,9 @@ class Person:
     def fetch(self) -> None:
         """Fetch, and reset the clone's checked-out branch to main; clone if there is no clone."""
         if not self.folder.exists():
-            git(self.folder.parent, "clone", "--quiet", str(self.bare), str(self.folder))
+            # not by hard links, which fail if a server writes meanwhile
+            ends = ("--no-local", str(self.bare), str(self.folder))
+            git(self.folder.parent, "clone", "--quiet", *ends)
             return
         self._git("fetch", "--quiet", "--prune", "origin")
         self._git("reset", "--quiet", "--hard", "origin/main")
