@@ -68,11 +68,11 @@ class Generator:
             )
             repository.signer, repository.runtime = signer, runtime
             try:
-                snapshot = snapshots.first_snapshot(repository, progress)
+                snapshot = snapshots.start_at(repository.objects, repository.tip(), progress)
             except Exception:  # a power cut may have damaged the clone, which is only a copy
                 if not repository.renew_if_damaged():
                     raise
-                snapshot = snapshots.first_snapshot(repository, progress)
+                snapshot = snapshots.start_at(repository.objects, repository.tip(), progress)
         except BaseException as error:
             self._slot.close()
             if isinstance(error, Exception):
@@ -111,7 +111,7 @@ class Generator:
         tip, now = self.snapshot.commit, self._runtime.now()
         with reading(self.address, objects):
             commit = revisions.resolve(objects, tip, revision, now)
-            return snapshots.snapshot_at(objects, commit.id)
+            return snapshots.state_at(objects, commit.id)
 
     @property
     def remote_status(self) -> RemoteStatus:

@@ -35,8 +35,9 @@ from demandops.repo.git.repository import (
 )
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history.commit_log import operations_since
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.ledger_files import restoration
-from demandops.repo.load.snapshot import ReadAhead, Snapshot
+from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.agenda import (
     FIRST_REST_S,
@@ -113,6 +114,9 @@ class RemoteMonitor:
 _TIDY_EVERY = 50
 # How often to carry out a change by a person while other generators, which do the same, are faster.
 _TRIES = 5
+# How many times the duration of a judgement passes before a configuration that is not in effect is
+# judged again because claims have ended: each renders all releases.
+_JUDGING_PAUSE_FACTOR = 20
 _NAME = "writer"  # the thread's name, under which a health check reports its failure
 
 
@@ -136,12 +140,12 @@ class Worker:
         self._heartbeat = repository.while_waiting = heartbeat
         self._rate_limit = RateLimit()
         self._agenda = Agenda(fetch_interval, self._runtime, local=repository.always_current)
-        self._ahead = ReadAhead()
         self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
         self._backoff = Backoff(self._batch_limit, self._runtime)
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
         self._logged: list[errors.Fault] = []
+        self._must_judge, self._judge_at = False, 0.0
         self._warned_of_signers = False
         self._ends_soon = self._runtime.event()
         self._warn_if_unsigned()
@@ -165,10 +169,14 @@ class Worker:
             # people may have decided about proposals before the start: answer these demands first
             if self._demands.proposed:
                 self._work()
-            while self._demands.wait(min(self._due_in().values())):
+            while self._demands.wait(min(*self._due_in().values(), self._seconds_until_judging)):
                 self._heartbeat()
                 self._work()
         self._approvals.suspend()
+
+    @property
+    def _seconds_until_judging(self) -> float:
+        return max(0.0, self._judge_at - self._runtime.monotonic()) if self._must_judge else inf
 
     def _due_in(self) -> dict[What, float]:
         main = str(self.snapshot.commit) if self._approvals.proposals else ""
@@ -181,10 +189,15 @@ class Worker:
             self._demands.take(batch, self._batch_limit)
             if batch or self._ended_leases(self.snapshot):
                 self._publish(batch)
-                if self.snapshot.problems:  # after a release, an invalid change may be valid
-                    self._try_to_carry_out_changes()
+                # without a claim that has ended, the configuration of main may be valid
+                self._must_judge = bool(self.snapshot.faults)
             elif not self._agenda.rest_left_s:
                 self._follow()
+            if self._must_judge and not self._seconds_until_judging:
+                self._must_judge, began = False, self._runtime.monotonic()
+                self._try_to_carry_out_changes(again=True)
+                end = self._runtime.monotonic()
+                self._judge_at = end + _JUDGING_PAUSE_FACTOR * (end - began)
             if self._packs_since_tidy >= _TIDY_EVERY:
                 self._packs_since_tidy = 0
                 self._repository.tidy()
@@ -518,17 +531,17 @@ class Worker:
         except (Unavailable, PushDenied) as error:
             log.warning("%s; the demands that await approval keep waiting", error)
 
-    def _try_to_carry_out_changes(self) -> None:
+    def _try_to_carry_out_changes(self, *, again: bool = False) -> None:
         try:
-            self._carry_out_changes()
+            self._carry_out_changes(again=again)
         except StateRepoError as error:
             self._record_unreachable(error)
 
-    def _carry_out_changes(self) -> bool:
+    def _carry_out_changes(self, *, again: bool = False) -> bool:
         """Publish the effects of people's changes; return whether a commit was published."""
         # the caller has fetched the changes
         for _ in range(_TRIES):
-            commits = self._new_commit_batch()
+            commits = self._new_commit_batch(again=again)
             if commits.publish():
                 self._record_published(commits)
                 return not commits.is_empty
@@ -538,21 +551,22 @@ class Worker:
         self._agenda.postpone()  # other generators are faster, and they carry out the same changes
         return False
 
-    def _new_commit_batch(self) -> CommitBatch:
+    def _new_commit_batch(self, *, again: bool = False) -> CommitBatch:
         # its first commits render people's changes, and do the own work that is due
         tip = self._repository.tip()
         newest = self.snapshot
-        if tip == newest.commit and not newest.problems and newest.is_rendered:
+        if tip == newest.commit and newest.is_rendered and not newest.put_back and not again:
             commits = CommitBatch(self._repository, newest)
         else:
-            advance = self._ahead.advance(self._repository.objects, newest, tip)
-            commits = CommitBatch(self._repository, advance.snapshot)
-            commits.follow(advance, newest, self._runtime.now())
+            now = self._runtime.now()
+            followed = snapshots.follow(self._repository.objects, newest, tip, now, again=again)
+            commits = CommitBatch(self._repository, followed.snapshot)
+            commits.follow(followed, now)
             # each problem of the state repo is logged once, until it is mended
-            before, self._logged = {*self._logged}, list(dict.fromkeys(commits.head.problems))
+            before, self._logged = {*self._logged}, list(dict.fromkeys(followed.snapshot.problems))
             for problem in self._logged:
                 if problem not in before:
-                    log.error("%s (its last valid version, if any, stays in effect)", problem)
+                    log.error("not in effect: %s", problem)
             for file in sorted({old.file for old in before} - {new.file for new in self._logged}):
                 log.info("%s is valid again", file or "the state repo")
         self._agenda.commit_due(commits)
