@@ -32,7 +32,6 @@ from demandops.render import gitops
 from demandops.render.gitops import path_of
 from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
-from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry, entry_of
 from demandops.repo.history.commit_message import PROPOSAL
 from demandops.repo.load import ledger_files
@@ -280,8 +279,7 @@ def _of_second_version(repo: Repository, commit: Commit, entry: LogEntry) -> Sta
     # ``Configuration`` names the commit of most, each ``Stands-In`` a file in another version, as
     # path and blob, and each ``Held-Back`` a claim that was in effect as last written before. All
     # files were valid at ``In-Force``.
-    valid = trees.commit_of(repo, entry.first("In-Force"))
-    source = entry.first("Configuration") or str(valid.id)
+    source = entry.first("Configuration") or entry.first("In-Force")
     files = trees.texts(trees.commit_of(repo, source).tree, CONFIG_ROOTS)
     try:
         for line in entry.trailers.get("Stands-In", ()):
@@ -291,16 +289,7 @@ def _of_second_version(repo: Repository, commit: Commit, entry: LogEntry) -> Sta
                 files[unquote(path)] = trees.text_of(repo[blob].peel(Blob))
     except (ValueError, KeyError, GitError):
         raise StateRepoError(f"commit {commit.id} has unreadable trailers") from None
-    ledger, put_back, _ = snapshots.ledger_at(repo, commit)
-    for path in {*entry.trailers.get("Held-Back", ()), *put_back}:
-        changes = commit_log.changes_to(repo, commit.id, path, str(valid.id))
-        by_generator = (each.entry.commit for each in changes if each.entry.by_generator)
-        tree = trees.commit_of(repo, next(by_generator, str(valid.id))).tree
-        before = ledger_files.valid_claim_at(commit.tree, path) or put_back.get(path)
-        if before is not None:
-            ledger = ledger.replace(before.key, None)
-        if (claim := ledger_files.valid_claim_at(tree, path)) is not None:
-            ledger = ledger.replace(claim.key, claim)
+    ledger, *_ = snapshots.ledger_at(repo, commit, entry=entry)
     return State(load_config(files), ledger, EVALUATE)
 
 

@@ -67,12 +67,18 @@ class Generator:
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
             repository.signer, repository.runtime = signer, runtime
+
+            def start() -> Snapshot:
+                tip = repository.tip()
+                snapshots.refuse_other_render_version(repository.objects, tip)
+                return snapshots.start_at(repository.objects, tip, progress)
+
             try:
-                snapshot = snapshots.start_at(repository.objects, repository.tip(), progress)
+                snapshot = start()
             except Exception:  # a power cut may have damaged the clone, which is only a copy
                 if not repository.renew_if_damaged():
                     raise
-                snapshot = snapshots.start_at(repository.objects, repository.tip(), progress)
+                snapshot = start()
         except BaseException as error:
             self._slot.close()
             if isinstance(error, Exception):

@@ -20,6 +20,7 @@ from demandops.base.errors import (
     internal,
 )
 from demandops.base.runtime import Runtime
+from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.decide.rollback import Restoration
 from demandops.model.config.config import Config
@@ -144,8 +145,10 @@ class Worker:
         self._backoff = Backoff(self._batch_limit, self._runtime)
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
-        self._logged: list[errors.Fault] = []
+        self._logged: tuple[errors.Fault, ...] = ()
         self._must_judge, self._judge_at = False, 0.0
+        # what a refused demand is told while the configuration of main is not in effect
+        self._not_in_effect = ""
         self._warned_of_signers = False
         self._ends_soon = self._runtime.event()
         self._warn_if_unsigned()
@@ -403,6 +406,10 @@ class Worker:
                 commit = str(commits.head.commit)
                 return Receipt(ticket.operation, ticket.demand.id, "released", commit)
             commits.record_in_next_commit(ticket.operation, "refused")
+            if self._not_in_effect:  # perhaps the demand is allowed by a file that is not in effect
+                cause, *more = error.faults
+                cause = replace(cause, message=f"{cause.message}; {self._not_in_effect}")
+                return type(error)([cause, *more])
             return error
         except SigningFailed as error:
             return error
@@ -555,22 +562,38 @@ class Worker:
         # its first commits render people's changes, and do the own work that is due
         tip = self._repository.tip()
         newest = self.snapshot
-        if tip == newest.commit and newest.is_rendered and not newest.put_back and not again:
+        if tip == newest.commit and newest.is_settled and not again:
             commits = CommitBatch(self._repository, newest)
         else:
-            now = self._runtime.now()
-            followed = snapshots.follow(self._repository.objects, newest, tip, now, again=again)
+            objects, now = self._repository.objects, self._runtime.now()
+            snapshots.refuse_other_render_version(objects, tip)
+            followed = snapshots.follow(objects, newest, tip, now, again=again)
             commits = CommitBatch(self._repository, followed.snapshot)
             commits.follow(followed, now)
-            # each problem of the state repo is logged once, until it is mended
-            before, self._logged = {*self._logged}, list(dict.fromkeys(followed.snapshot.problems))
-            for problem in self._logged:
-                if problem not in before:
-                    log.error("not in effect: %s", problem)
-            for file in sorted({old.file for old in before} - {new.file for new in self._logged}):
-                log.info("%s is valid again", file or "the state repo")
+            self._tell_of_faults(followed.snapshot)
         self._agenda.commit_due(commits)
         return commits
+
+    def _tell_of_faults(self, snapshot: Snapshot) -> None:
+        for problem in snapshot.claim_faults:
+            log.error("put back as it was: %s", problem)
+        # each fault of the configuration is logged once, until it is mended
+        before, self._logged = self._logged, tuple(dict.fromkeys(snapshot.faults))
+        if before == self._logged:
+            return
+        for problem in self._logged:
+            if problem not in before:
+                log.error("not in effect: %s", problem)
+        for file in sorted({old.file for old in before} - {new.file for new in self._logged}):
+            log.info("%s is valid again", file or "the state repo")
+        self._not_in_effect = ""
+        if snapshot.faults:
+            first, *_ = snapshots.problems_of(self._repository.objects, snapshot)
+            self._not_in_effect = (
+                f"{first.file or MAIN_BRANCH} is not in effect since commit {first.since[:10]} "
+                f"({first.message}), so this was decided with the "
+                f"configuration of commit {str(snapshot.configuration)[:10]}"
+            )
 
     def _record_published(self, commits: CommitBatch) -> None:
         if commits.followed:

@@ -72,6 +72,12 @@ class Snapshot:
     is_rendered: bool = True
 
     @property
+    def is_settled(self) -> bool:
+        """Whether nothing is left to judge, to render or to put back."""
+        is_judged = bool(self.faults) or self.told is None
+        return self.is_rendered and not self.put_back and is_judged
+
+    @property
     def problems(self) -> tuple[Fault, ...]:
         return (*self.faults, *self.claim_faults)
 
@@ -111,7 +117,7 @@ def load(
     commit = trees.commit_of(repo, revision)
     tree, configuration = commit.tree, configuration_of(repo, commit, entry)
     config = config_at(trees.commit_of(repo, configuration).tree)
-    ledger, put_back, faults = ledger_at(repo, commit, progress)
+    ledger, put_back, faults = ledger_at(repo, commit, progress, entry)
     told = None if configuration == commit.id else config_ids(tree)
     state = State(config, ledger, EVALUATE)
     return Snapshot(
@@ -120,14 +126,21 @@ def load(
 
 
 def ledger_at(
-    repo: Repository, commit: Commit, progress: Progress = lambda done, total: None
+    repo: Repository,
+    commit: Commit,
+    progress: Progress = lambda done, total: None,
+    entry: LogEntry | None = None,
 ) -> tuple[Ledger, dict[str, Claim | None], list[Fault]]:
     """Return the ledger, with what is in effect for files of claims that are not valid."""
     put_back, faults = dict[str, Claim | None](), list[Fault]()
+    # the second version put no claim back, and named those that were not in effect
+    held_back = entry.trailers.get("Held-Back", ()) if entry else ()
     ledger = Ledger()
     for path, text in _claim_texts(commit.tree, progress):
         try:
             claim: Claim | None = claim_files.read(text, path)
+            if path in held_back:
+                raise InvalidInput([fault("", "no demand could have booked this").within(path)])
         except InvalidInput as error:
             faults += error.faults
             put_back[path] = claim = ledger_files.as_last_written(repo, commit.id, path)
@@ -267,7 +280,6 @@ def follow(
     Only files that differ are read. A configuration that was not valid is judged ``again`` only if
     asked, as it may be valid once a claim has ended.
     """
-    refuse_other_render_version(repo, to)
     for commit, entry in commit_log.commits(repo, to, before.commit):
         if entry.by_generator and commit_log.is_by_generator(repo, commit):
             try:
@@ -278,8 +290,7 @@ def follow(
                 except (InvalidInput, StateRepoError):
                     raise refused from None
             break
-    is_settled = before.is_rendered and not before.put_back and before.told is None
-    if before.commit == to and is_settled and not before.faults:
+    if before.commit == to and before.is_settled and not again:
         return Followed(before, before)
     ids = config_ids(trees.commit_of(repo, to).tree)
     in_effect = trees.commit_of(repo, before.configuration)
