@@ -22,7 +22,7 @@ from demandops.serve.generator import Generator
 from tests.kit import rig
 from tests.kit.chance import IN_FULL
 from tests.kit.config import override
-from tests.kit.repo import FORGER
+from tests.kit.repo import FORGER, differing
 from tests.kit.repo import read as text
 from tests.kit.rig import Person, goal, leave
 
@@ -64,6 +64,54 @@ def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
     first, second = random.sample(changes[:7], 2)
     chosen = first | second if random.random() < 0.3 else random.choice(changes)
     return {**chosen, "README.md": str(random.random())}
+
+
+STYLES: dict[str, list[str]] = {
+    "merge": ["checkout -q main", "merge -q --no-ff -m Merge BRANCH"],
+    "fast-forward": ["checkout -q main", "merge -q --ff-only BRANCH"],
+    "squash": ["checkout -q main", "merge -q --squash BRANCH", "commit -q -m Squash"],
+    "rebase": ["checkout -q main", "cherry-pick main..BRANCH"],
+    # main becomes the second parent, as after a `git pull` on the branch
+    "the other way round": [
+        "checkout -q BRANCH",
+        "merge -q --no-ff -m Pull main",
+        "branch -q -f main BRANCH",
+        "checkout -q main",
+    ],
+}
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_a_merge_of_any_style_is_judged_and_so_is_a_second_one_of_the_same_branch(
+    bare: Path, person: Person, style: str
+) -> None:
+    def merge(text: str, *, number: int) -> None:
+        person.fetch()
+        folder = person.folder
+        # the second time on the same branch, where the forge's way of merging allows that
+        start = "main~1" if number == 1 and style != "fast-forward" else "main"
+        if number == 1 or style in ("squash", "rebase", "fast-forward"):
+            rig.git(folder, "branch", "-f", "topic", start)
+        rig.git(folder, "checkout", "-q", "topic")
+        (folder / "overrides" / "topic.yaml").write_text(text)
+        rig.git(folder, "add", "overrides")
+        rig.git(folder, "commit", "-q", "-m", "The topic")
+        for command in STYLES[style]:
+            rig.git(folder, *command.replace("BRANCH", "topic").split())
+        rig.git(folder, "push", "-q", "origin", "main")
+
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1), goal(2))
+        merge(BROKEN, number=1)
+        rig.book(generator, goal(3))
+        assert {each.file for each in generator.snapshot.problems} == {"overrides/topic.yaml"}
+    with rig.running(bare) as generator:
+        rig.book(generator, leave(1))
+        assert generator.snapshot.problems
+        merge(BROKEN.replace("many", "5"), number=2)
+        rig.book(generator, goal(4))
+        assert generator.snapshot.problems == ()
+    assert differing(bare) == {}
 
 
 def includes(generator: Generator, commit: str) -> bool:

@@ -269,17 +269,17 @@ def of_follow(
     names, after = ", ".join(release.name for release in releases), f" after commit {cause[:12]}"
     title = f"Update ledger{after}"
     if configuration:
-        title = f"Keep the configuration of commit {configuration[:12]}{after}"
+        title = f"Keep the configuration of commit {configuration[:12]}, as the next is not valid"
     elif names:
         title = f"Update {one_line(names, _MAX_SUBJECT - len(after) - len('Update '))}{after}"
     told = [f"  {each}" for each in problems[:_MOST_PROBLEMS]]
     if len(problems) > _MOST_PROBLEMS:
         told.append(f"  and {len(problems) - _MOST_PROBLEMS} more")
     held = [
-        f"The configuration at commit {cause[:12]} is not valid, so nothing of it is in effect: "
-        f"that of commit {configuration[:12]} stays in effect until a commit is valid. "
-        f"To mend it, {remedy}",
+        f"Not valid at commit {cause[:12]}, so that the configuration of commit "
+        f"{configuration[:12]} stays in effect, as a whole, until a commit is valid:",
         *told,
+        f"To mend this, {remedy}",
     ]
     paragraphs = [
         [title],
