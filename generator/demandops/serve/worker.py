@@ -598,6 +598,8 @@ class Worker:
     def _record_published(self, commits: CommitBatch) -> None:
         if commits.followed:
             log.info("%s", commits.followed)
+        if commits.tells:
+            self._approvals.tell_of_faults(commits.head)
         before, self.snapshot = self.snapshot, commits.head
         # also true after a person's merge that needs no commit of the generator
         if self.snapshot.commit != before.commit:

@@ -49,6 +49,8 @@ class CommitBatch:
         self.awaited = False
         # the log line about the follow commit, which renders people's changes; empty if none
         self.followed = ""
+        # whether that commit is the first to say that a configuration is not in effect
+        self.tells = False
 
     @property
     def is_empty(self) -> bool:
@@ -135,6 +137,7 @@ class CommitBatch:
             self._objects, before.configuration, self.start.commit
         )
         held = self.head.faults
+        self.tells = bool(held) and self.head.told != self.head.refused
         text = commit_message.of_follow(
             change.releases,
             str(self.start.commit),
