@@ -183,6 +183,8 @@ def test_the_pull_request_whose_merge_is_not_in_effect_is_told(
         proposed = Proposed(generator, goals.put("visit", "user"))
         petra.merge(proposed.branch)
         assert proposed.outcome() == "booked"
+        gone = {"kind": "Demand", "demand": "visit", "requesters": ["user"], "operation": "release"}
+        rig.book(generator, gone)
     made = petra.change({"overrides/odd.yaml": "`a`: @b\n"})
     pull = {"number": 1, "state": "closed", "merged_at": "2026-01-01", "merge_commit_sha": made}
     hub.pulls.append(
