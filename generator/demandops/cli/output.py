@@ -91,7 +91,7 @@ def warn_of_problems(repo: Reader, snapshot: Snapshot) -> None:
 def in_effect(repo: Reader, snapshot: Snapshot) -> str:
     """Tell which configuration is in effect instead of the newest, and how to change that."""
     return (
-        f"the configuration of commit {str(snapshot.configuration)[:10]} is in effect until a "
+        f"the configuration of commit {str(snapshot.configuration)[:10]} stays in effect until a "
         f"commit is valid; {repo.how_to_mend(snapshot)}"
     )
 

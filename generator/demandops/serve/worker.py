@@ -568,6 +568,7 @@ class Worker:
             objects, now = self._repository.objects, self._runtime.now()
             snapshots.refuse_other_render_version(objects, tip)
             followed = snapshots.follow(objects, newest, tip, now, again=again)
+            followed = snapshots.with_started_leases(objects, followed, now)
             commits = CommitBatch(self._repository, followed.snapshot)
             commits.follow(followed, now)
             self._tell_of_faults(followed.snapshot)

@@ -83,7 +83,7 @@ class ReusableRows:
 
 class CommitState:
     def __init__(
-        self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem, ...], remedy: str
+        self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem, ...], remedy: str = ""
     ) -> None:
         # ``remedy`` tells how to mend a configuration that is not in effect
         self.snapshot, self.entry, self.problems, self.remedy = snapshot, entry, problems, remedy

@@ -316,6 +316,22 @@ def follow(
     return _carried_out(repo, before, held, now)
 
 
+def with_started_leases(repo: Repository, followed: Followed, now: datetime) -> Followed:
+    # an approved claim's lease starts only now, because else it could end before the approval
+    snapshot, files = followed.snapshot, dict(followed.change.files)
+    ledger = snapshot.state.ledger
+    for claim in ledger.unstarted_claims():
+        assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
+        path = claim_files.path_of(claim.key)
+        earlier = ledger_files.lease_before_approval(repo, snapshot.commit, path)
+        started = replace(claim, lease=claim.lease.started(now, earlier))
+        ledger = ledger.replace(claim.key, started)
+        files[path] = claim_files.text_of(started)
+    # a lease does not affect a release, so the usage of nodes need not be counted again
+    snapshot = replace(snapshot, state=snapshot.state.with_ledger(ledger, ()))
+    return replace(followed, snapshot=snapshot, change=replace(followed.change, files=files))
+
+
 def _taken_over(repo: Repository, before: Snapshot, commit: Commit, entry: LogEntry) -> Snapshot:
     # What another generator has published is right, so nothing of it is judged or rendered again.
     configuration = configuration_of(repo, commit, entry)
@@ -475,19 +491,9 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
         **{path: claim_files.text_of(claim) if claim else None for path, claim in put_back.items()},
         **carried.files,
     }
-    # an approved claim's lease starts only now, because else it could end before the approval
-    ledger = state.ledger
-    for claim in ledger.unstarted_claims():
-        assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
-        path = claim_files.path_of(claim.key)
-        earlier = ledger_files.lease_before_approval(repo, commit.id, path)
-        started = replace(claim, lease=claim.lease.started(now, earlier))
-        ledger = ledger.replace(claim.key, started)
-        files[path] = claim_files.text_of(started)
     snapshot = replace(
         wanted,
-        # a lease does not affect a release, so the usage of nodes need not be counted again
-        state=state.with_ledger(ledger, ()),
+        state=state,
         put_back=put_back,
         claim_faults=tuple(faults),
         is_rendered=True,
