@@ -271,7 +271,8 @@ class DemandNode(Node):  # type: ignore[misc]
 
         problems, warning = generator.snapshot.problems, ""
         if problems:
-            warning = f"{len(problems)} problems; the last valid version is in effect"
+            held = str(generator.snapshot.configuration)[:10]
+            warning = f"{len(problems)} problems; the configuration of commit {held} is in effect"
         values = {"problems": str(len(problems))}
         for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
             values[f"problem {number}"] = str(problem)

@@ -125,7 +125,7 @@ def test_a_fleet_is_watched_live(on: On, joined: GitRepo) -> None:
         watching.read_until("A note on the fleet")
         valid = joined.files()["inventory/nodes.yaml"]
         joined.commit({"inventory/nodes.yaml": "nodez: []\n"}, "A slip\n")
-        watching.read_until("not well, last valid state: inventory/nodes.yaml: ")
+        watching.read_until("not well: problems in files: ")
         joined.commit({"inventory/nodes.yaml": valid}, "Mended\n")
         watching.read_until("Mended")
         watching.type(CTRL_C)

@@ -145,6 +145,13 @@ class Person:
         self._git("fetch", "--quiet", "--prune", "origin")
         self._git("reset", "--quiet", "--hard", "origin/main")
 
+    def write(self, files: Mapping[str, str | None]) -> None:
+        """Write ``files`` into the clone on top of main, without a commit."""
+        self.fetch()
+        for path, text in files.items():
+            (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (self.folder / path).write_text(str(text))
+
     def read(self, path: str) -> str:
         return GitRepo(self.bare).files()[path]
 
@@ -294,7 +301,7 @@ def branches(repo: Path) -> list[str]:
 
 def state_of(repo: Path, revision: str = "main") -> State:
     opened = pygit2.Repository(str(repo))
-    return snapshots.load(opened, opened.revparse_single(revision).id).state
+    return snapshots.state_at(opened, opened.revparse_single(revision).id).state
 
 
 def books(repo: Path, revision: str = "main") -> dict[str, Any]:

@@ -20,7 +20,6 @@ from demandops.cli.json_output import print_json, show
 from demandops.cli.table import Column, Table
 from demandops.model.config.base_model import parse_file
 from demandops.model.ledger.records import _WaitingFile
-from demandops.repo.load import last_valid_config
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -90,15 +89,6 @@ def test_commands_print_no_text_that_controls_a_terminal(capsys: Any) -> None:
 def test_a_comment_has_no_text_that_ends_its_span() -> None:
     assert is_visible(check.code(HOSTILE))
     assert check.fence("a\u202e\n```\nb", "yaml") == "````yaml\na\\u202e\n```\nb\n````\n"
-
-
-def test_the_problem_report_quotes_and_finds_its_problems_again() -> None:
-    found = [Fault("invalid", "a\u202e", HOSTILE, "overrides/a\n\u200b.yaml")]
-    first = last_valid_config.with_origins(found, (), lambda path: ("c" * 40, "Eve\u202e <e@x>"))
-    text = last_valid_config.write(first)
-    assert text and all(is_visible(line) for line in text.split("\n"))
-    again = last_valid_config.with_origins(found, last_valid_config.read(text), lambda path: None)
-    assert again == first
 
 
 def test_faults_that_are_passed_on_are_still_counted_right() -> None:

@@ -53,8 +53,8 @@ def modeline(path: str, schema: str) -> str:  # with it, editors check a file wi
     return f"# yaml-language-server: $schema={up}{SCHEMAS_ROOT}/{schema}.json\n"
 
 
-# The top-level folder with the generator's reports to people. No decision depends on the reports.
-NOTES_ROOT = ".demandops"
+# Where the second version listed the files that were not valid; `demandops upgrade` removes it.
+REPORTS_ROOT = ".demandops"
 
 _PACKAGE = Path(__file__).parents[1]
 _CHECKOUT = _PACKAGE.parents[1]

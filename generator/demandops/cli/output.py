@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as Bar
     from rich.text import Text
+
+    from demandops.repo.load.snapshot import Snapshot
+    from demandops.repo.reader import Reader
 
 _MOST_LISTED = 3
 
@@ -78,9 +81,19 @@ class _Errors:
 errors = _Errors()
 
 
-def warn_of(problems: Iterable[object]) -> None:
-    for problem in problems:
-        errors.print(f"warning: {problem}; the file's last valid version, if any, is in effect")
+def warn_of_problems(repo: Reader, snapshot: Snapshot) -> None:
+    for problem in repo.problems_of(snapshot):
+        errors.print(f"warning: not in effect: {problem}")
+    if snapshot.faults:
+        errors.print(f"warning: {in_effect(repo, snapshot)}")
+
+
+def in_effect(repo: Reader, snapshot: Snapshot) -> str:
+    """Tell which configuration is in effect instead of the newest, and how to change that."""
+    return (
+        f"the configuration of commit {str(snapshot.configuration)[:10]} stays in effect until a "
+        f"commit is valid; {repo.how_to_mend(snapshot)}"
+    )
 
 
 def warn_of_not_rendered(paths: Collection[str]) -> None:

@@ -297,7 +297,7 @@ def _names(repo: Reader, kind: str) -> Iterator[str]:
     if kind == "proposals":
         yield from (proposal.branch for proposal in pending_proposals(repo.repository))
         return
-    world = repo.last_valid_snapshot(repo.commit()).state
+    world = repo.snapshot().state
     if kind == "releases":
         yield from (release.name for release in release_causes.releases(world))
     elif kind in ("requesters", "demands"):

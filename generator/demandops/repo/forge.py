@@ -55,6 +55,8 @@ class Forge(ABC):
     NAME: ClassVar[str]
     # The HTTP headers of each call, with `{token}` for the token
     HEADERS: ClassVar[dict[str, str]]
+    # The last part of the path of a commit's pull requests
+    OF_COMMIT: ClassVar[str]
     # The HTTP status with which the forge refuses a second pull request for a branch
     EXISTS: ClassVar[int]
 
@@ -62,7 +64,8 @@ class Forge(ABC):
         self._api = api.rstrip("/")
         self._token = token
         self._owner = owner
-        self._pulls = f"/repos/{quote(owner, safe='')}/{quote(name, safe='')}/pulls"
+        self._project = f"/repos/{quote(owner, safe='')}/{quote(name, safe='')}"
+        self._pulls = f"{self._project}/pulls"
 
     @abstractmethod
     def find(self, branch: str, target: str) -> PullRequest | None:
@@ -92,6 +95,18 @@ class Forge(ABC):
     def close(self, request: PullRequest, body: str) -> None:
         # the text says why, because a comment would need a further permission of the token
         self._call("PATCH", f"{self._pulls}/{request.number}", {"state": "closed", "body": body})
+
+    def comment(self, commit: str, text: str) -> None:
+        """Comment on the pull requests whose merge brought a commit to main, if there are any."""
+        try:
+            found = self._call("GET", f"{self._project}/commits/{commit}/{self.OF_COMMIT}")
+        except ForgeError as error:
+            if error.status in (404, 409, 422):  # it came by a push, or the forge has not seen it
+                return
+            raise
+        for data in found if isinstance(found, list) else [found]:
+            path = f"{self._project}/issues/{self._read(data).number}/comments"
+            self._call("POST", path, {"body": text})
 
     def _call(self, method: str, path: str, body: Mapping[str, object] | None = None) -> Any:  # noqa: ANN401 - the caller knows the answer's form
         where = f"{method} {self._api}{path}"
@@ -147,6 +162,7 @@ class GitHub(Forge):
         "Authorization": "Bearer {token}",
         "X-GitHub-Api-Version": "2022-11-28",
     }
+    OF_COMMIT = "pulls"
     EXISTS = 422
 
     def find(self, branch: str, target: str) -> PullRequest | None:
@@ -170,6 +186,7 @@ class Gitea(Forge):
 
     NAME = "Gitea"
     HEADERS = {"Accept": "application/json", "Authorization": "token {token}"}  # noqa: RUF012
+    OF_COMMIT = "pull"
     EXISTS = 409
 
     def find(self, branch: str, target: str) -> PullRequest | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -12,9 +11,9 @@ import pygit2
 from pygit2 import Oid, Tree
 
 from demandops.base import settings
-from demandops.base.errors import Fault, InvalidInput, StateRepoError
+from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.runtime import REAL
-from demandops.base.strict_yaml import FieldLines, with_lines
+from demandops.base.strict_yaml import with_lines
 from demandops.decide.changeset import FileReader
 from demandops.decide.rollback import Restoration
 from demandops.decide.state import rendered_files
@@ -26,9 +25,9 @@ from demandops.repo.git.local_repository import LastFetch, connect, is_url
 from demandops.repo.git.repository import StateRepository, access_error, reading
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
-from demandops.repo.load import last_valid_config, ledger_files
+from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
-from demandops.repo.load.snapshot import Progress, Snapshot
+from demandops.repo.load.snapshot import Problem, Progress, Snapshot
 from demandops.repo.verification import Verdict
 from demandops.repo.write.journal import Slot
 
@@ -79,7 +78,7 @@ class Reader:
         return other
 
     def refuse_other_render_version(self) -> None:
-        last_valid_config.refuse_other_render_version(self._objects, self._tip)
+        snapshots.refuse_other_render_version(self._objects, self._tip)
 
     def commit(self, revision: str | None = None) -> str:
         if not revision:
@@ -91,35 +90,19 @@ class Reader:
     ) -> Snapshot:
         commit = self.commit(revision)
         try:
-            return snapshots.snapshot_at(self._objects, commit, progress)
+            return snapshots.state_at(self._objects, commit, progress)
         except InvalidInput as error:
             raise InvalidInput(with_lines(error.faults, self.file_reader(commit))) from None
 
-    def last_valid_snapshot(
-        self, revision: str, progress: Progress = lambda done, total: None
-    ) -> Snapshot:
-        # unlike `snapshot`, this works before a generator has quarantined the invalid files
-        try:
-            return self.snapshot(revision, progress)
-        except InvalidInput:
-            return snapshots.state_at(self._objects, self.commit(revision), progress)
-
     def snapshot_after(self, before: Snapshot) -> Snapshot:
-        is_recorded = snapshots.record_at(self._objects, self._tip).first("In-Force")
-        if before.problems or is_recorded:
-            return self.last_valid_snapshot(str(self._tip))
-        return snapshots.state_after(self._objects, before, self._tip)
+        now = commit_log.time_of(trees.commit_of(self._objects, self._tip))
+        return snapshots.follow(self._objects, before, self._tip, now).snapshot
 
-    def problems(self, revision: str | None = None) -> tuple[last_valid_config.Problem, ...]:
-        read = self.file_reader(revision)
-        lines = FieldLines(read)
-        return tuple(
-            replace(problem, line=lines.of(problem.file, problem.field))
-            for problem in last_valid_config.read(read(last_valid_config.PATH))
-        )
+    def problems_of(self, snapshot: Snapshot) -> tuple[Problem, ...]:
+        return snapshots.problems_of(self._objects, snapshot)
 
-    def problems_of(self, snapshot: Snapshot) -> tuple[last_valid_config.Problem | Fault, ...]:
-        return self.problems(str(snapshot.commit)) or snapshot.problems
+    def how_to_mend(self, snapshot: Snapshot) -> str:
+        return snapshots.how_to_mend(self._objects, snapshot) if snapshot.faults else ""
 
     def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
         # only a person's commit may leave such files, and rendering everything takes time
@@ -165,7 +148,7 @@ class Reader:
         return lambda path: trees.read_text(tree, path)
 
     def config(self) -> Config:
-        return last_valid_config.config_at(self._tree())
+        return snapshots.config_at(self._tree())
 
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
         # newest first; the commits up to REV, after A up to B in ``A..B``, or all

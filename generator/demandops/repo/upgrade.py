@@ -15,7 +15,7 @@ from datetime import datetime
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput, StateRepoError, fault
 from demandops.base.runtime import REAL
-from demandops.base.settings import LEDGER_API_VERSION, RENDER_VERSION
+from demandops.base.settings import LEDGER_API_VERSION, RENDER_VERSION, REPORTS_ROOT
 from demandops.decide.carriers import with_one_carrier
 from demandops.decide.changeset import planned_releases
 from demandops.decide.edits import changed_claim_files, faults_of_edit, update_ledger
@@ -28,14 +28,14 @@ from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import LEDGER_ROOT, ClaimKey
-from demandops.model.ledger.ledger import Ledger
+from demandops.model.ledger.ledger import Ledger, changes_on
 from demandops.model.release import ServiceRelease
 from demandops.repo import reader
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import commit_log, commit_message
-from demandops.repo.load import last_valid_config, ledger_files
+from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress
 from demandops.repo.write.commit_batch import CommitBatch
@@ -112,6 +112,8 @@ def _plan(
     # the upgrade, the batch and the state to commit, and the claims that may change
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
+    if snapshot.claim_faults:
+        raise InvalidInput(snapshot.claim_faults)
     batch, old = CommitBatch(repository, snapshot), snapshot.state.config
     tree = trees.commit_of(objects, tip).tree
     files = trees.texts(tree, CONFIG_ROOTS)
@@ -121,12 +123,12 @@ def _plan(
     state = State(config, snapshot.state.ledger, EVALUATE)
     # people may have edited since the state in effect; their edits are checked and applied too
     start = snapshots.start_at(objects, tip)
-    edits = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, start.state.ledger)
+    subjects = ledger_files.changed_subjects(start.state.ledger, state.ledger)
+    edits = changes_on(start.state.ledger, state.ledger, subjects)
     refused = list(faults_of_edit(start.state, state, edits))
     if refused:
         raise InvalidInput(refused)
-    subjects = ledger_files.changed_subjects(start.state.ledger, state.ledger)
-    markers = last_valid_config.end_markers_at(tree)
+    markers = snapshots.end_markers_at(tree)
     applied = update_ledger(start.state, state, subjects, markers, now)
     state = replace(state, ledger=applied.ledger)
     if old.repo_settings.render_version < _FIRST_WITH_MARKS:
@@ -151,9 +153,9 @@ def _plan(
             raise InvalidInput(held)
     files_of_ledger = _in_this_schema(trees.texts(tree, (LEDGER_ROOT,)), state.ledger)
     written = {**files_of_ledger, **applied.files, **changed_claims}
-    changed = dict(batch.render_all(state, written).files)
-    if last_valid_config.PATH in tree:  # the state is valid, or the upgrade is refused
-        changed[last_valid_config.PATH] = None
+    changed = dict(snapshots.render_all(tree, state, written).files)
+    # the second version listed there what was not valid
+    changed |= dict.fromkeys(trees.texts(tree, (REPORTS_ROOT,)))
     changed |= {path: text for path, text in by_people.items() if text != files[path]}
     upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))
     return upgrade, batch, state, (*applied.keys, *keys)

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from urllib.parse import unquote
 
 import pygit2
-from pygit2 import Commit, Oid, Repository, Tree
+from pygit2 import Blob, Commit, GitError, Oid, Repository, Tree
 
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.settings import (
     GENERATED_ROOTS,
     LEDGER_API_VERSION,
-    NOTES_ROOT,
     RENDER_VERSION,
+    REPORTS_ROOT,
 )
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.config import CONFIG_ROOTS
+from demandops.model.config.load import load as load_config
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
@@ -34,6 +36,7 @@ from demandops.repo.history.commit_log import LogEntry, entry_of
 from demandops.repo.history.commit_message import PROPOSAL
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
+from demandops.templating.evaluator import EVALUATE
 
 # ---- the files that a commit of the generator changed, but was not allowed to change ----
 #
@@ -48,7 +51,7 @@ _REWRITING = ("follow", "upgrade")
 _ENDING = ("follow", "upgrade", "expire-override")
 
 
-def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
+def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> Iterator[str]:
     # These are files that people write, claims of demands that the message does not name, claims in
     # another format than the generator's, and records that the commit's operation must not change.
     if not commit.parents:  # `demandops init` writes everything
@@ -58,10 +61,13 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
         demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
     named = {f"{claim_files.segment(demand)}.yaml" for demand in demands}
+    # a claim may be put back as it was at the generator's commit before
+    since = entry.first("Since") if operation == "follow" else ""
+    earlier = trees.commit_of(repo, since).tree if since else None
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
         # of a folder, the files count
-        if root in (*GENERATED_ROOTS, NOTES_ROOT) or isinstance(
+        if root in (*GENERATED_ROOTS, REPORTS_ROOT) or isinstance(
             trees.entry(commit.tree, path), Tree
         ):
             continue
@@ -79,7 +85,9 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
         elif path.rsplit("/", 1)[-1] in named:
             if blob and not _is_canonical(commit, path):
                 yield path
-        elif operation not in _REWRITING or not _only_rewrites(commit, path):
+        elif (operation not in _REWRITING or not _only_rewrites(commit, path)) and not (
+            earlier is not None and trees.entry_id(earlier, path) == blob
+        ):
             yield path
 
 
@@ -118,8 +126,8 @@ def _is_canonical(commit: Commit, path: str) -> bool:
 # ---- rendering the files again, and comparing them with the committed ones ----
 #
 # A commit is verified whole or by differences. To verify a commit whole, the program loads and
-# renders everything. It does so for the first and the last commit, for each commit that records
-# invalid files, and for each commit whose configuration differs from that of the commit before.
+# renders everything. It does so for the first and the last commit, and for each commit with another
+# configuration in effect than the commit before.
 #
 # By differences, the program starts from the commit that it verified before. It assumes that equal
 # object ids mean equal files, and that plans and rendered files depend only on their input. It
@@ -144,8 +152,9 @@ class Verdict:
 
 class _Proof:
     # the files that a commit should have, rendered again to compare with its committed files
-    def __init__(self, state: State, commit: Commit) -> None:
+    def __init__(self, state: State, commit: Commit, source: Tree) -> None:
         self.state, self._commit = state, commit
+        self._configuration = snapshots.config_ids(source)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         # with an override that sets ``hold``: such a file's text depends on the parent commit
         self._held: dict[ReleaseKey, Release] = {}
@@ -154,11 +163,11 @@ class _Proof:
         self._committed = _generated_files(commit.tree)
         self._render(all_keys(state))
 
-    def can_advance_to(self, commit: Commit) -> bool:
-        # The configuration and ended overrides may affect all releases. With a problem report, some
-        # files are not in effect.
-        roots = (*CONFIG_ROOTS, NOTES_ROOT, records.MARKERS_ROOT)
-        return not trees.differ(self._commit.tree, commit.tree, roots)
+    def can_advance_to(self, commit: Commit, source: Tree) -> bool:
+        # ``source`` has the configuration, which may affect all releases, as ended overrides may
+        return snapshots.config_ids(source) == self._configuration and not trees.differ(
+            self._commit.tree, commit.tree, (records.MARKERS_ROOT,)
+        )
 
     def advance(self, commit: Commit) -> None:
         before, after = self._commit.tree, commit.tree
@@ -220,21 +229,22 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         if verdict.skipped:
             yield verdict
             continue
-        verdict = replace(verdict, touched=tuple(sorted(disallowed_files(commit, entry))))
+        verdict = replace(verdict, touched=tuple(sorted(disallowed_files(repo, commit, entry))))
         before, proof = proof, None  # proof stays None if the commit cannot be read
         try:
             if whole or place == len(commits) or entry.first("In-Force"):
-                state = _loaded(repo, entry)
+                state = _loaded(repo, commit, entry)
                 parent = trees.parent_tree(commit) if _holds(state) else None
                 held = trees.texts(parent, GENERATED_ROOTS) if parent is not None else {}
                 wanted = {path: _blob(t) for path, t in rendered_files(state, held).items()}
                 differing = _differing(wanted, _generated_files(commit.tree))
             else:
-                if before is not None and before.can_advance_to(commit):
+                source = trees.commit_of(repo, snapshots.configuration_of(repo, commit, entry)).tree
+                if before is not None and before.can_advance_to(commit, source):
                     before.advance(commit)
                     proof = before
                 else:
-                    proof = _Proof(_loaded(repo, entry), commit)
+                    proof = _Proof(_loaded(repo, commit, entry), commit, source)
                 differing = proof.differing()
         except _Unreadable as error:
             why = f"a file was not valid at this commit: {error}"
@@ -252,11 +262,35 @@ class _Unreadable(Exception):
     """Raised when a commit cannot be verified because one of its files is not valid."""
 
 
-def _loaded(repo: Repository, entry: LogEntry) -> State:
+def _loaded(repo: Repository, commit: Commit, entry: LogEntry) -> State:
     try:
-        return snapshots.recorded_state(repo, entry).state
+        if entry.first("In-Force"):
+            return _of_second_version(repo, commit, entry)
+        snapshot = snapshots.load(repo, commit.id, entry=entry)
     except InvalidInput as error:
         raise _Unreadable(error.faults[0]) from None
+    if snapshot.claim_faults:
+        raise _Unreadable(snapshot.claim_faults[0])
+    return snapshot.state
+
+
+def _of_second_version(repo: Repository, commit: Commit, entry: LogEntry) -> State:
+    # In the second version, files of several commits were in effect while one was not valid:
+    # ``Configuration`` names the commit of most, each ``Stands-In`` a file in another version, as
+    # path and blob, and each ``Held-Back`` a claim that was in effect as last written before. All
+    # files were valid at ``In-Force``.
+    source = entry.first("Configuration") or entry.first("In-Force")
+    files = trees.texts(trees.commit_of(repo, source).tree, CONFIG_ROOTS)
+    try:
+        for line in entry.trailers.get("Stands-In", ()):
+            path, _, blob = line.rpartition(" ")
+            files.pop(unquote(path), None)
+            if blob != "none":
+                files[unquote(path)] = trees.text_of(repo[blob].peel(Blob))
+    except (ValueError, KeyError, GitError):
+        raise StateRepoError(f"commit {commit.id} has unreadable trailers") from None
+    ledger, *_ = snapshots.ledger_at(repo, commit, entry=entry)
+    return State(load_config(files), ledger, EVALUATE)
 
 
 def _differing(wanted: Mapping[str, Oid], committed: Mapping[str, Oid]) -> tuple[str, ...]:

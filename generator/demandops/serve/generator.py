@@ -67,12 +67,18 @@ class Generator:
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
             repository.signer, repository.runtime = signer, runtime
+
+            def start() -> Snapshot:
+                tip = repository.tip()
+                snapshots.refuse_other_render_version(repository.objects, tip)
+                return snapshots.start_at(repository.objects, tip, progress)
+
             try:
-                snapshot = snapshots.first_snapshot(repository, progress)
+                snapshot = start()
             except Exception:  # a power cut may have damaged the clone, which is only a copy
                 if not repository.renew_if_damaged():
                     raise
-                snapshot = snapshots.first_snapshot(repository, progress)
+                snapshot = start()
         except BaseException as error:
             self._slot.close()
             if isinstance(error, Exception):
@@ -111,7 +117,7 @@ class Generator:
         tip, now = self.snapshot.commit, self._runtime.now()
         with reading(self.address, objects):
             commit = revisions.resolve(objects, tip, revision, now)
-            return snapshots.snapshot_at(objects, commit.id)
+            return snapshots.state_at(objects, commit.id)
 
     @property
     def remote_status(self) -> RemoteStatus:

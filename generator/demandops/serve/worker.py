@@ -20,6 +20,7 @@ from demandops.base.errors import (
     internal,
 )
 from demandops.base.runtime import Runtime
+from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.decide.rollback import Restoration
 from demandops.model.config.config import Config
@@ -35,8 +36,9 @@ from demandops.repo.git.repository import (
 )
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history.commit_log import operations_since
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.ledger_files import restoration
-from demandops.repo.load.snapshot import ReadAhead, Snapshot
+from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.agenda import (
     FIRST_REST_S,
@@ -113,6 +115,9 @@ class RemoteMonitor:
 _TIDY_EVERY = 50
 # How often to carry out a change by a person while other generators, which do the same, are faster.
 _TRIES = 5
+# How many times the duration of a judgement passes before a configuration that is not in effect is
+# judged again because claims have ended: each renders all releases.
+_JUDGING_PAUSE_FACTOR = 20
 _NAME = "writer"  # the thread's name, under which a health check reports its failure
 
 
@@ -136,12 +141,14 @@ class Worker:
         self._heartbeat = repository.while_waiting = heartbeat
         self._rate_limit = RateLimit()
         self._agenda = Agenda(fetch_interval, self._runtime, local=repository.always_current)
-        self._ahead = ReadAhead()
         self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
         self._backoff = Backoff(self._batch_limit, self._runtime)
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
-        self._logged: list[errors.Fault] = []
+        self._logged: tuple[errors.Fault, ...] = ()
+        self._must_judge, self._judge_at = False, 0.0
+        # what a refused demand is told while the configuration of main is not in effect
+        self._not_in_effect = ""
         self._warned_of_signers = False
         self._ends_soon = self._runtime.event()
         self._warn_if_unsigned()
@@ -165,10 +172,14 @@ class Worker:
             # people may have decided about proposals before the start: answer these demands first
             if self._demands.proposed:
                 self._work()
-            while self._demands.wait(min(self._due_in().values())):
+            while self._demands.wait(min(*self._due_in().values(), self._seconds_until_judging)):
                 self._heartbeat()
                 self._work()
         self._approvals.suspend()
+
+    @property
+    def _seconds_until_judging(self) -> float:
+        return max(0.0, self._judge_at - self._runtime.monotonic()) if self._must_judge else inf
 
     def _due_in(self) -> dict[What, float]:
         main = str(self.snapshot.commit) if self._approvals.proposals else ""
@@ -181,10 +192,15 @@ class Worker:
             self._demands.take(batch, self._batch_limit)
             if batch or self._ended_leases(self.snapshot):
                 self._publish(batch)
-                if self.snapshot.problems:  # after a release, an invalid change may be valid
-                    self._try_to_carry_out_changes()
+                # without a claim that has ended, the configuration of main may be valid
+                self._must_judge = bool(self.snapshot.faults)
             elif not self._agenda.rest_left_s:
                 self._follow()
+            if self._must_judge and not self._seconds_until_judging:
+                self._must_judge, began = False, self._runtime.monotonic()
+                self._try_to_carry_out_changes(again=True)
+                end = self._runtime.monotonic()
+                self._judge_at = end + _JUDGING_PAUSE_FACTOR * (end - began)
             if self._packs_since_tidy >= _TIDY_EVERY:
                 self._packs_since_tidy = 0
                 self._repository.tidy()
@@ -390,6 +406,10 @@ class Worker:
                 commit = str(commits.head.commit)
                 return Receipt(ticket.operation, ticket.demand.id, "released", commit)
             commits.record_in_next_commit(ticket.operation, "refused")
+            if self._not_in_effect:  # perhaps the demand is allowed by a file that is not in effect
+                cause, *more = error.faults
+                cause = replace(cause, message=f"{cause.message}; {self._not_in_effect}")
+                return type(error)([cause, *more])
             return error
         except SigningFailed as error:
             return error
@@ -518,17 +538,17 @@ class Worker:
         except (Unavailable, PushDenied) as error:
             log.warning("%s; the demands that await approval keep waiting", error)
 
-    def _try_to_carry_out_changes(self) -> None:
+    def _try_to_carry_out_changes(self, *, again: bool = False) -> None:
         try:
-            self._carry_out_changes()
+            self._carry_out_changes(again=again)
         except StateRepoError as error:
             self._record_unreachable(error)
 
-    def _carry_out_changes(self) -> bool:
+    def _carry_out_changes(self, *, again: bool = False) -> bool:
         """Publish the effects of people's changes; return whether a commit was published."""
         # the caller has fetched the changes
         for _ in range(_TRIES):
-            commits = self._new_commit_batch()
+            commits = self._new_commit_batch(again=again)
             if commits.publish():
                 self._record_published(commits)
                 return not commits.is_empty
@@ -538,29 +558,49 @@ class Worker:
         self._agenda.postpone()  # other generators are faster, and they carry out the same changes
         return False
 
-    def _new_commit_batch(self) -> CommitBatch:
+    def _new_commit_batch(self, *, again: bool = False) -> CommitBatch:
         # its first commits render people's changes, and do the own work that is due
         tip = self._repository.tip()
         newest = self.snapshot
-        if tip == newest.commit and not newest.problems and newest.is_rendered:
+        if tip == newest.commit and newest.is_settled and not again:
             commits = CommitBatch(self._repository, newest)
         else:
-            advance = self._ahead.advance(self._repository.objects, newest, tip)
-            commits = CommitBatch(self._repository, advance.snapshot)
-            commits.follow(advance, newest, self._runtime.now())
-            # each problem of the state repo is logged once, until it is mended
-            before, self._logged = {*self._logged}, list(dict.fromkeys(commits.head.problems))
-            for problem in self._logged:
-                if problem not in before:
-                    log.error("%s (its last valid version, if any, stays in effect)", problem)
-            for file in sorted({old.file for old in before} - {new.file for new in self._logged}):
-                log.info("%s is valid again", file or "the state repo")
+            objects, now = self._repository.objects, self._runtime.now()
+            snapshots.refuse_other_render_version(objects, tip)
+            followed = snapshots.follow(objects, newest, tip, now, again=again)
+            followed = snapshots.with_started_leases(objects, followed, now)
+            commits = CommitBatch(self._repository, followed.snapshot)
+            commits.follow(followed, now)
+            self._tell_of_faults(followed.snapshot)
         self._agenda.commit_due(commits)
         return commits
+
+    def _tell_of_faults(self, snapshot: Snapshot) -> None:
+        for problem in snapshot.claim_faults:
+            log.error("put back as it was: %s", problem)
+        # each fault of the configuration is logged once, until it is mended
+        before, self._logged = self._logged, tuple(dict.fromkeys(snapshot.faults))
+        if before == self._logged:
+            return
+        for problem in self._logged:
+            if problem not in before:
+                log.error("not in effect: %s", problem)
+        for file in sorted({old.file for old in before} - {new.file for new in self._logged}):
+            log.info("%s is valid again", file or "the state repo")
+        self._not_in_effect = ""
+        if snapshot.faults:
+            first, *_ = snapshots.problems_of(self._repository.objects, snapshot)
+            self._not_in_effect = (
+                f"{first.file or MAIN_BRANCH} is not in effect since commit {first.since[:10]} "
+                f"({first.message}), so this was decided with the "
+                f"configuration of commit {str(snapshot.configuration)[:10]}"
+            )
 
     def _record_published(self, commits: CommitBatch) -> None:
         if commits.followed:
             log.info("%s", commits.followed)
+        if commits.tells:
+            self._approvals.tell_of_faults(commits.head)
         before, self.snapshot = self.snapshot, commits.head
         # also true after a person's merge that needs no commit of the generator
         if self.snapshot.commit != before.commit:

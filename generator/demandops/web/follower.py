@@ -131,7 +131,7 @@ class Follower:
         self.version = 0
         # The newest commits, at most `MOST_COMMITS`, newest first.
         self.history: tuple[Commit, ...] = ()
-        snapshot = reader.last_valid_snapshot(reader.commit(), progress)
+        snapshot = reader.snapshot(progress=progress)
         self._newest = self._situation_at(_commit_state(reader, snapshot))
         self._thread = REAL.keep_running("page", self._run)
 
@@ -161,7 +161,7 @@ class Follower:
             return newest
         with self._loading:  # load only one commit at a time, because loading may take seconds
             commit_state = self._commit_states.pop(commit, None) or _commit_state(
-                reader, reader.last_valid_snapshot(commit)
+                reader, reader.snapshot(commit)
             )
             # added again at the end, so that the state that was not used for longest is dropped
             self._commit_states[commit] = commit_state
@@ -242,4 +242,5 @@ class Follower:
 
 def _commit_state(reader: Reader, snapshot: Snapshot) -> CommitState:
     entry = next(reader.log(str(snapshot.commit)))
-    return CommitState(snapshot, entry, reader.problems_of(snapshot))
+    problems = reader.problems_of(snapshot)
+    return CommitState(snapshot, entry, problems, reader.how_to_mend(snapshot))

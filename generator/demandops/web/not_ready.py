@@ -18,7 +18,6 @@ from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import GENERATOR_NAME
-from demandops.repo.load.last_valid_config import Problem
 from demandops.views import release_causes
 from demandops.web.lists import Cell, Filter, Link, Part, Row, cell, exactly
 from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of, worst_word
@@ -216,21 +215,19 @@ def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Caus
         )
     for problem in now.commit_state.problems:
         change = last_change(problem.file)
-        who = (
-            f"{change.author}, who last changed it" if change else "the person who last changed it"
-        )
-        if isinstance(problem, Problem) and problem.author:
+        who = "the person who last changed it"
+        if problem.author:
             who = f"{problem.author}, whose commit made it invalid"
         field = f", {problem.field}" if problem.field else ""
-        since = problem.since if isinstance(problem, Problem) else ""
+        held = now.commit_state.snapshot.configuration
         yield Cause(
             "invalid",
             Part(f"{problem.file or 'The configuration'}{field}"),
-            "is not valid, so its last valid version stays in effect",
+            f"is not valid, so the configuration of commit {str(held)[:10]} stays in effect",
             Remedy(
                 who,
-                "correct the file by pull request",
-                shlex.join(["git", "show", since[:10]]) if since else "demandops check .",
+                now.commit_state.remedy or "correct the file by pull request",
+                f"git show {problem.since[:10]}" if problem.since else "demandops check .",
             ),
             told=problem.message,
             since=change.time if change else None,

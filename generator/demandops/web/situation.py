@@ -8,7 +8,6 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any
 
-from demandops.base.errors import Fault
 from demandops.base.naming import Subject, SubjectKind
 from demandops.cluster import rollouts
 from demandops.cluster.health import Health, Target
@@ -22,8 +21,7 @@ from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World, changes_on
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
-from demandops.repo.load.last_valid_config import Problem
-from demandops.repo.load.snapshot import Snapshot
+from demandops.repo.load.snapshot import Problem, Snapshot
 from demandops.repo.write.proposal_branch import PendingProposal
 from demandops.views import release_causes
 from demandops.views.release_causes import Entry, override_report
@@ -85,9 +83,10 @@ class ReusableRows:
 
 class CommitState:
     def __init__(
-        self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem | Fault, ...]
+        self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem, ...], remedy: str = ""
     ) -> None:
-        self.snapshot, self.entry, self.problems = snapshot, entry, problems
+        # ``remedy`` tells how to mend a configuration that is not in effect
+        self.snapshot, self.entry, self.problems, self.remedy = snapshot, entry, problems, remedy
         self.commit, self.state = str(snapshot.commit), snapshot.state
         self.config = snapshot.state.config
         # The rows of each list that was shown, by the list's name.

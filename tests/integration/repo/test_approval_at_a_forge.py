@@ -51,6 +51,14 @@ class Hub:
             assert body is not None
             self.pulls[int(url.path.rsplit("/", 1)[1]) - 1].update(body)
             return 200, self.pulls[-1]
+        if url.path.startswith("/repos/its/state/commits/"):
+            commit = url.path.split("/")[-2]
+            return 200, [pull for pull in self.pulls if pull.get("merge_commit_sha") == commit]
+        if method == "POST" and url.path.endswith("/comments"):
+            assert body is not None
+            number = int(url.path.split("/")[-2])
+            self.pulls[number - 1].setdefault("comments", []).append(body["body"])
+            return 201, {}
         branch = parse_qs(url.query)["head"][0].removeprefix("its:")
         return 200, [pull for pull in self.pulls if pull["head"] == branch][-1:]
 
@@ -166,3 +174,25 @@ def test_a_forge_that_is_away_holds_nothing_up_and_is_asked_again(
     assert f"{branch}: GET http://127.0.0.1" in caplog.text
     assert "503 'Service unavailable'" in caplog.text
     assert TOKEN not in caplog.text
+
+
+def test_the_pull_request_whose_merge_is_not_in_effect_is_told(
+    hub: Hub, url: str, bare: Path, petra: Person
+) -> None:
+    with rig.running(url) as generator:
+        proposed = Proposed(generator, goals.put("visit", "user"))
+        petra.merge(proposed.branch)
+        assert proposed.outcome() == "booked"
+        gone = {"kind": "Demand", "demand": "visit", "requesters": ["user"], "operation": "release"}
+        rig.book(generator, gone)
+    made = petra.change({"overrides/odd.yaml": "`a`: @b\n"})
+    pull = {"number": 1, "state": "closed", "merged_at": "2026-01-01", "merge_commit_sha": made}
+    hub.pulls.append(
+        pull | {"number": 2, "head": "odd", "html_url": "https://github.com/its/state/pull/2"}
+    )
+    with rig.running(url) as generator:
+        generator.fetch_now()
+        rig.wait_until(lambda: "comments" in hub.pulls[1], "the pull request has a comment")
+    (told,) = hub.pulls[1]["comments"]
+    assert told.startswith("This is not in effect, because main is not valid; ")
+    assert "overrides/odd.yaml" in told and f"git revert --no-edit -m 1 {made[:10]}" in told

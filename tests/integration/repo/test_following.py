@@ -129,12 +129,13 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
         made = person.edit(NODES, f"{first}c-its", f"{first}c-itz")
         followed(bare, made)
     status = demandops("status", "--state-repo", bare)
-    problem = status.out.splitlines()[1].strip()
+    problem, mend = (line.strip() for line in status.out.splitlines()[1:3])
     assert problem.startswith(f"{NODES}:") and f"(since {made[:10]} by Petra" in problem
+    assert mend.endswith(f"git revert --no-edit -m 1 {made[:10]}")
     assert "of-edge-fusion-1" in status.out
     assert (status.code, "problems in files: 1" in status.err) == (1, True)
     (told,) = demandops("status", "--state-repo", bare, "--output", "json").json()["faults"]
     assert (told["file"], told["field"], told["since"]) == (NODES, "nodes[0].cluster", made)
     books = demandops("bookkeeping", "--state-repo", bare)
     assert (books.code, "edge/fusion-1" in books.out) == (0, True)
-    assert books.err.startswith(f"warning: {problem}; ")
+    assert books.err.splitlines() == [f"warning: not in effect: {problem}", f"warning: {mend}"]

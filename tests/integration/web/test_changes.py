@@ -91,7 +91,7 @@ def test_an_invalid_file_names_who_wrote_it(
     assert cause.remedy.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
     assert cause.remedy.command.startswith("git show ")
     assert "registry/images.yaml" in look("/overrides").text
-    assert "its last valid version stays in effect" in page.text
+    assert "stays in effect" in page.text and "git revert --no-edit -m 1 " in page.text
 
 
 def test_too_many_causes_are_counted(

@@ -43,8 +43,13 @@ def messages() -> Iterator[tuple[str, str]]:
     yield "a shutdown that lists what was not held", text(desk.send(goal))
     releases = [ReleaseChange("of-edge", "object-fusion on edge", "", "change", ("- replicas 1",))]
     problems = [fault("nodes[0].id", "appears twice; remove one").within("inventory/nodes.yaml")]
-    follow = commit_message.of_follow(releases, "c" * 40, "b" * 40, problems)
-    yield "a commit that follows one of a person", follow
+    ids, how = ("c" * 40, "b" * 40), "correct the files, or undo the commits: git revert cccc"
+    followed = commit_message.of_follow(releases, *ids, "", [], "")
+    yield "a commit that follows one of a person", followed
+    held = commit_message.of_follow([], *ids, "b" * 40, problems, how)
+    yield "a commit that follows one whose configuration is not valid", held
+    put_back = commit_message.of_follow([], *ids, "", problems, "")
+    yield "a commit that puts a claim back", put_back
     long = Desk(now=NOW).join("vehicle00", application="edge/" + "fusion" * 40)
     yield "a long id", text(long).split("\n")[0]
     repo = waiting_repo()

@@ -132,6 +132,12 @@ def test_a_request_is_closed(kind: str, token: Path) -> None:
         made.close(PullRequest(7, LINKS[kind], "open"), "Closed: ` was replaced `")
 
 
+def test_what_a_commit_came_by_gets_a_comment(kind: str, token: Path) -> None:
+    with forge(kind, "comment", token) as made:
+        made.comment("c" * 40, "It is not in effect.")
+        made.comment("d" * 40, "It is not in effect.")
+
+
 def test_a_refusal_is_told_in_the_forges_words_without_the_token(kind: str, token: Path) -> None:
     with forge(kind, "denied", token) as made, pytest.raises(ForgeError) as error:
         open_one(made)

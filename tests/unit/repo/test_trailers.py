@@ -80,16 +80,3 @@ def test_operations_that_arrived_after_a_commit_are_found_and_no_others(
     everything = {"op-1": str(first), "op-2": str(second), "op-3": str(tip)}
     for none in ("", "0" * 40, "no commit", beside):  # `beside` is on another branch
         assert found(none) == everything
-
-
-def test_the_newest_commit_of_the_generator_is_found_behind_those_of_people(
-    repo: pygit2.Repository,
-) -> None:
-    first = _commit(repo, "op-1")
-    person = _commit(repo, "", first)
-    assert commit_log.last_generator_commit(repo, _commit(repo, "", person)) == first
-    merge = _commit(repo, "", person, _commit(repo, "op-2", first))
-    assert commit_log.last_generator_commit(repo, merge) == first, (
-        "the search must follow the first parents"
-    )
-    assert commit_log.last_generator_commit(repo, _commit(repo, "")) is None

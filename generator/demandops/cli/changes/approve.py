@@ -106,7 +106,7 @@ def approve(
             base = repo.base_of(proposal.commit)
             entries, preview = differences(repo, base, proposal.commit)
             # anybody can commit under the generator's name, so what is more than demands is shown
-            by_hand = repo.edited_files(base, repo.last_valid_snapshot(proposal.commit))
+            by_hand = repo.edited_files(base, repo.snapshot(proposal.commit))
             for line in (
                 *entry_lines(entries),
                 *release_lines(preview.releases, "release "),

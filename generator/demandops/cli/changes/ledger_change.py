@@ -274,7 +274,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
 
 def _dry_run_rollback(repo: Reader, goal: Rollback, base: str) -> Json:
     with progress("reading the ledger") as report:
-        state = repo.last_valid_snapshot(base, report).state
+        state = repo.snapshot(base, report).state
     request = repo.restoration(goal)
     decision = decide(state, request, REAL.now(), repo.file_reader(base))
     return {"outcome": decision.outcome, **_consequences(decision)}

@@ -179,7 +179,7 @@ def override_text(name: str, fields: dict[str, Any], note: str = "") -> str:
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    overrides = repo.last_valid_snapshot(repo.commit()).state.config.overrides
+    overrides = repo.snapshot().state.config.overrides
     if edit.name not in overrides and repo.file_reader()(edit.path) is not None:
         message = "is not valid, so nothing is overridden; correct or remove the file with git"
         raise InvalidInput.at("", message, file=edit.path)
@@ -297,7 +297,7 @@ def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) 
     summary = f"Resume {name or described(selected)}"
     edit = Edit(name or name_of(selected), None, summary, options.reason)
     with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
-        overrides = repo.last_valid_snapshot(repo.commit()).state.config.overrides
+        overrides = repo.snapshot().state.config.overrides
         override = overrides.get(edit.name)
         # a person may have changed what the file selects since it was suspended
         if override and not name and not selects(override, selected):

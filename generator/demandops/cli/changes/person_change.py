@@ -128,7 +128,7 @@ class Edit:
 def consequence(repo: Reader, edit: Edit) -> Entry:
     """Return the edited override as if it were on main, and what it affects."""
     with progress("reading the ledger") as report:
-        state = repo.last_valid_snapshot(repo.commit(), report).state
+        state = repo.snapshot(progress=report).state
     world = World(state.config, state.ledger)
     if edit.text is not None:
         override = Override.from_file(edit.name, parse_file(OverrideFile, edit.text, edit.path))
@@ -147,7 +147,7 @@ def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
         return person_commit.commit_to_main(repo.repository, files, details)
     branch = f"override/{edit.name}"
     title, reason = harmless(one_line(edit.summary)), one_line(edit.reason)
-    proposals = repo.last_valid_snapshot(repo.commit()).state.config.repo_settings.proposals
+    proposals = repo.snapshot().state.config.repo_settings.proposals
     # only GitLab opens a merge request for a push
     push_options = merge_request(title, reason) if proposals.forge == "gitlab" else []
     pushed = person_commit.commit_to_branch(repo.repository, files, details, branch, push_options)

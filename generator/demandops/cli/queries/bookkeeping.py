@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import click
 
 from demandops.cli.json_output import Json, output_option, show, time_text
-from demandops.cli.output import at_option, progress, version_lines, warn_of
+from demandops.cli.output import at_option, progress, version_lines, warn_of_problems
 from demandops.cli.table import Table, column, joined, table_of
 from demandops.cli.target import state_repo_option
 from demandops.repo import reader
@@ -30,7 +30,7 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     with reader.opened(state_repo) as repo:
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(at, report)
-        warn_of(repo.problems() if at is None else ())
+        warn_of_problems(repo, snapshot)
     commit = str(snapshot.commit)
     data = as_data(derive(snapshot.state), commit)
     capacity = [

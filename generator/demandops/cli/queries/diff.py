@@ -8,7 +8,7 @@ from dataclasses import asdict
 import click
 
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import SIGNS, progress, warn_of
+from demandops.cli.output import SIGNS, progress, warn_of_problems
 from demandops.cli.target import state_repo_option
 from demandops.decide.changeset import MergePreview, ReleaseChange, planned_releases, preview
 from demandops.render.gitops import CLUSTERS_ROOT
@@ -65,10 +65,9 @@ def differences(
 
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
-    # an invalid file counts with its last valid version
     with progress("reading the ledger") as report:
-        snapshot = repo.last_valid_snapshot(repo.commit(revision), report)
-    warn_of(repo.problems_of(snapshot))
+        snapshot = repo.snapshot(revision, report)
+    warn_of_problems(repo, snapshot)
     return snapshot
 
 

@@ -24,8 +24,8 @@ from demandops.cli.output import (
     painted,
     progress,
     version_lines,
-    warn_of,
     warn_of_not_rendered,
+    warn_of_problems,
 )
 from demandops.cli.table import CellOf, Column, Table, column, joined, table_of
 from demandops.cli.target import name_options, names_of, state_repo_option
@@ -510,7 +510,7 @@ def get(
 def _read_source(repo: Reader, at: str | None) -> Source:
     with progress("reading the ledger") as report:
         snapshot = repo.snapshot(at, report)
-    warn_of(repo.problems() if at is None else ())
+    warn_of_problems(repo, snapshot)
     not_rendered = repo.not_rendered(snapshot) if at is None else frozenset()
     warn_of_not_rendered(not_rendered)
     return Source(repo, snapshot, REAL.now(), not_rendered)

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import click
 
-from demandops.base.errors import InvalidInput, StateRepoError
-from demandops.base.quoting import one_line
+from demandops.base.errors import StateRepoError
 from demandops.base.runtime import REAL
 from demandops.cli.json_output import commit_data
 from demandops.cli.output import errors, painted, progress, read_by
@@ -58,14 +57,9 @@ def watch(state_repo: str, access_file: Path | None) -> None:
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     try:
         with reader.opened(state_repo) as repo, Live(screen=True, auto_refresh=False) as live:
-            away, shown = "", list[str]()
+            away = ""
             while True:
-                try:
-                    shown = _screen(repo, clusters, away)
-                except InvalidInput as error:  # until a generator has reported the invalid file
-                    if not shown:
-                        raise
-                    shown[1] = painted(f"not well, last valid state: {one_line(str(error))}", "red")
+                shown = _screen(repo, clusters, away)
                 live.update(Text.from_ansi("\n".join(shown), no_wrap=True), refresh=True)
                 REAL.sleep(2.0)
                 try:

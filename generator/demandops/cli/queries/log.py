@@ -152,7 +152,7 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
     ]
     if (node := given["node"]) is not None:
         # no commit needs to have changed a node that the inventory has
-        nodes = {*repo.last_valid_snapshot(repo.commit()).state.config.nodes}
+        nodes = {*repo.snapshot().state.config.nodes}
         if node not in nodes and not any(
             repo.changes_node(entry.commit, node) for entry in repo.log()
         ):

@@ -15,6 +15,7 @@ from demandops.cli.json_output import Json, output_option, release_data, show, v
 from demandops.cli.output import (
     busy,
     errors,
+    in_effect,
     progress,
     read_by,
     version_lines,
@@ -31,7 +32,7 @@ from demandops.decide.warnings import MissingInput, missing_inputs
 from demandops.model.config.base_model import duration_text, seconds_of
 from demandops.repo import reader
 from demandops.repo.git.repository import RemoteAway
-from demandops.repo.load.last_valid_config import Problem
+from demandops.repo.load.snapshot import Problem
 from demandops.repo.reader import Reader
 
 _PATIENCE_S = 10
@@ -43,8 +44,7 @@ _PATIENCE_S = 10
 @click.option(
     "--wait",
     is_flag=True,
-    help="Wait until the exit code would be 0, or until --timeout has passed. An invalid file that "
-    "no generator has reported yet ends the wait at once.",
+    help="Wait until the exit code would be 0, or until --timeout has passed.",
 )
 @click.option(
     "--timeout",
@@ -133,6 +133,7 @@ class Status:
     commit: str
     rows: list[Json]  # the releases
     problems: tuple[Problem, ...]
+    in_effect: str  # which configuration is, if not that of the commit
     clusters: frozenset[str]
     not_rendered: frozenset[str]
     old_bootstraps: tuple[OldBootstrap, ...]
@@ -147,7 +148,6 @@ class Status:
         clusters: Mapping[str, clusters_file.ClusterAccess],
         patience_s: int = _PATIENCE_S,
     ) -> Status:
-        problems = repo.problems()
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(progress=report)
         commit = str(snapshot.commit)
@@ -194,7 +194,8 @@ class Status:
         return cls(
             commit,
             rows,
-            problems,
+            repo.problems_of(snapshot),
+            in_effect(repo, snapshot) if snapshot.faults else "",
             frozenset(snapshot.state.config.clusters),
             repo.not_rendered(snapshot),
             tuple(old_bootstraps(domains, caches, repo.file_reader(commit))),
@@ -222,7 +223,7 @@ class Status:
         return ", ".join(f"{what}: {count}" for what, count in counts.items() if count)
 
     def data(self) -> Json:
-        faults = [{"code": "invalid", **asdict(problem)} for problem in self.problems]
+        faults = [{"code": "invalid", **problem._asdict()} for problem in self.problems]
         return {
             "commit": self.commit,
             "releases": self.rows,
@@ -240,8 +241,8 @@ class Status:
         text: list[str | Table] = [f"  {problem}" for problem in self.problems]
         if self.problems:
             count = len(self.problems)
-            title = "1 problem" if count == 1 else f"{count} problems"
-            text.insert(0, f"{title}; the last valid version of each file, if any, is in effect:")
+            text.insert(0, "1 problem:" if count == 1 else f"{count} problems:")
+            text += [self.in_effect] if self.in_effect else []
         further = map(str, (*self.old_bootstraps, *self.orphans))
         return [*text, releases_table(self.rows), *further, f"desired: {self.commit}"]
 

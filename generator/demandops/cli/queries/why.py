@@ -161,8 +161,8 @@ def demand_commits(repo: Reader, snapshot: Snapshot, id: str) -> list[LogEntry]:
 def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
     path = path.rstrip("/")
     text = repo.file_reader(str(snapshot.commit))(path)
-    if (key := ledger_files.key_of(path, snapshot.state.ledger)) is not None:
-        return Match("claim", key.demand, path, subject=key.subject)
+    if (claim := ledger_files.claim_in(path, snapshot.state.ledger)) is not None:
+        return Match("claim", claim.demand, path, subject=claim.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
     release = release_causes.release_named(snapshot.state, name)
     if release is not None and path_of(release) == path:

@@ -320,7 +320,7 @@ class ConfigReader:
                 second[0], f"{second[1]}{dot_key}", f"'{name}' appears twice; remove one"
             )
             return
-        # both files, so that the changed one is quarantined, whichever of them a person changed
+        # both files, because the fault may be in either
         for (file, place), (other, _) in ((first, second), (second, first)):
             self.add_fault(file, f"{place}{dot_key}", f"'{name}' is in {other} too; remove one")
 

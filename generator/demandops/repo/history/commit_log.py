@@ -17,7 +17,7 @@ from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
 from demandops.base.errors import StateRepoError
-from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT
+from demandops.base.settings import GENERATED_ROOTS
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.ledger.claim import LEDGER_ROOT
 from demandops.render.gitops import CLUSTERS_ROOT
@@ -202,11 +202,6 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
     return outcomes
 
 
-def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
-    line = first_parents(repo, tip)
-    return next((commit.id for commit in line if is_by_generator(repo, commit)), None)
-
-
 @dataclass(frozen=True, slots=True)
 class PathChange:
     entry: LogEntry
@@ -285,7 +280,7 @@ def _git_log(repo: Repository, tip: str | Oid, after: str | None, *query: str) -
 # people's commits, and its author names these people. A commit is by a person if no generator on
 # any machine made it, or if it is of a proposal.
 
-_ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
+_ROOTS = (*CONFIG_ROOTS, LEDGER_ROOT, *GENERATED_ROOTS)
 _MOST_NAMED = 20
 _NO_ADDRESS = "@demandops.invalid"
 
@@ -308,20 +303,18 @@ def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
     return [commit for commit in commits if _touches(commit, _ROOTS)]
 
 
-def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
+def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str]]:
     # A fault is caused by the last person's commit that changed its file, else by the last one that
     # changed any file of the generator. The function returns the commit's id and author.
+    commits = list(person_commits(repo, to, known))
 
-    @cache  # the commits are read only when needed: most problems are already in the report
-    def commits() -> list[Commit]:
-        return list(person_commits(repo, to, known))
-
-    def origin(path: str) -> tuple[str, str] | None:
+    @cache  # a file may have many faults
+    def origin(path: str) -> tuple[str, str]:
         for paths in ((path,) if path else (), _ROOTS):
-            for commit in commits():
+            for commit in commits:
                 if _touches(commit, paths):
                     return str(commit.id), str(author_of(commit))
-        return None
+        return "", ""
 
     return origin
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 
 import pygit2
 
-from demandops.base.errors import Fault
 from demandops.base.naming import SubjectKind
 from demandops.base.quoting import escaped, harmless, is_visible, one_line
 from demandops.base.settings import RENDER_VERSION
@@ -99,12 +98,13 @@ GENERATOR_EMAIL = "generator@demandops.invalid"
 #
 # The trailers are a contract: an auditor without this program finds everything with ``git log
 # --format='%(trailers:key=Requester)'``. Values from outside appear in a message only as
-# :func:`compose` quotes them. :mod:`.snapshot` adds the trailers about quarantined files.
+# :func:`compose` quotes them. :mod:`.snapshot` adds the trailer about the configuration in effect.
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
 _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
+_MOST_PROBLEMS = 20
 _UNCHANGED = "Desired state: unchanged."
 _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 _CRUD = " .,:;\"'\\"  # Git removes these at both ends of a name, and refuses an empty name
@@ -257,27 +257,35 @@ def of_follow(
     releases: Iterable[ReleaseChange],
     cause: str,
     since: str,
-    problems: Iterable[Fault],
+    configuration: str,
+    problems: Sequence[object],
+    remedy: str,
     more: Iterable[tuple[str, str]] = (),
-    *,
-    reports: bool = True,
 ) -> str:
-    # ``cause`` is the newest commit whose changes are rendered, and ``since`` the one whose state
-    # was in effect before them. ``reports`` says whether the problem report changes.
-    problems, releases = list(problems), tuple(releases)
+    # ``cause`` is the newest commit that is carried out, and ``since`` the one whose state was in
+    # effect before. ``configuration`` is the commit whose configuration stays in effect because
+    # that of ``cause`` is not valid, else empty; and ``remedy`` how to mend that.
+    releases = tuple(releases)
     names, after = ", ".join(release.name for release in releases), f" after commit {cause[:12]}"
     title = f"Update ledger{after}"
-    if names:
+    if configuration:
+        title = f"Keep the configuration of commit {configuration[:12]}, as the next is not valid"
+    elif names:
         title = f"Update {one_line(names, _MAX_SUBJECT - len(after) - len('Update '))}{after}"
-    elif reports:
-        title = "Report invalid files" if problems else "Report that all files are valid"
+    told = [f"  {each}" for each in problems[:_MOST_PROBLEMS]]
+    if len(problems) > _MOST_PROBLEMS:
+        told.append(f"  and {len(problems) - _MOST_PROBLEMS} more")
+    held = [
+        f"Not valid at commit {cause[:12]}, so that the configuration of commit "
+        f"{configuration[:12]} stays in effect, as a whole, until a commit is valid:",
+        *told,
+        f"To mend this, {remedy}",
+    ]
     paragraphs = [
         [title],
         [f"Why: commits up to {cause[:12]} changed configuration, ledger or generated files."],
         _desired_state(releases) if releases else [],
-        ["Not applied, because not valid:", *(f"  {each}" for each in problems)]
-        if problems
-        else [],
+        held if configuration else ["Put back, because not valid:", *told] if told else [],
     ]
     trailers = [
         ("Operation", "follow"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 
 from pygit2 import Oid, Repository, Tree
@@ -15,7 +14,7 @@ from demandops.decide.rollback import Restoration
 from demandops.model.demand.demand import Lease, Rollback
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import Claim, ClaimKey
-from demandops.model.ledger.ledger import ClaimChange, Ledger
+from demandops.model.ledger.ledger import Ledger
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log, commit_message
@@ -57,42 +56,33 @@ def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
         return None
 
 
-def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
-    """Return the key of the claim whose file has this path; a search of the whole ledger."""
+def claim_in(path: str, ledger: Ledger) -> Claim | None:
+    """Return the claim whose file has this path; a search of the whole ledger."""
+    # a path has slugs and digests of the ids, so it does not give the key
     if claim_files.kind_of(path) is None:
         return None
-    # a path has slugs and digests of the ids, so it does not give the key
-    return next((claim.key for claim in ledger if claim_files.path_of(claim.key) == path), None)
+    return next((claim for claim in ledger if claim_files.path_of(claim.key) == path), None)
 
 
-def owner_faults(claim: Claim | None, path: str, ledger: Ledger) -> Iterator[Fault]:
+def owner_faults(claim: Claim | None, was: Claim | None, path: str) -> Iterator[Fault]:
     # the generator books no such claim, but a person or an earlier version may replace the file
-    owner = key_of(path, ledger) if claim and not ledger.get(claim.key) else None
-    if claim is not None and owner is not None:
+    if claim and was and claim.key != was.key:
         message = (
-            f"the file belongs to {owner.subject} of demand '{owner.demand}', but has a claim on "
+            f"the file belongs to {was.subject} of demand '{was.demand}', but has a claim on "
             f"{claim.subject} of demand '{claim.demand}'; restore the file, and use other ids"
         )
         yield fault("", message, code="conflict").within(path)
 
 
-def last_valid_claims(
-    repo: Repository, last_valid_commit: Oid, to: Oid, paths: Iterable[str]
-) -> dict[str, Claim | None]:
-    # If the generator has changed a file since ``last_valid_commit``, the claim that it wrote last
-    # counts, else the claim at that commit.
-    tree = trees.commit_of(repo, last_valid_commit).tree
-    claims = {path: claim_at(tree, path) for path in paths}
-    left = set(claims)
-    for commit, _ in commit_log.commits(repo, to, last_valid_commit) if left else ():
-        before = trees.parent_tree(commit)
-        changed = [path for path in left if trees.differ(before, commit.tree, (path,))]
-        if before is not None and changed and commit_log.is_by_generator(repo, commit):
-            for path in changed:
-                with suppress(InvalidInput):  # only a forged commit has an invalid claim
-                    claims[path] = claim_at(commit.tree, path)
-                    left.remove(path)
-    return claims
+def as_last_written(repo: Repository, to: Oid, path: str) -> Claim | None:
+    """Return the newest valid claim that a generator, or a merged proposal, wrote to a file."""
+    for change in commit_log.changes_to(repo, to, path):
+        if change.entry.trailers:  # a person's commit has none
+            tree = trees.commit_of(repo, change.entry.commit).tree
+            claim = valid_claim_at(tree, path)
+            if claim or not change.exists_after:
+                return claim
+    return None
 
 
 def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
@@ -102,26 +92,6 @@ def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
         if claim is None or claim.lease is None or claim.lease.has_started:
             return claim.lease if claim else None
     return None
-
-
-def claims_by_people(
-    repo: Repository, last_valid_commit: Oid, to: Oid, in_effect: Ledger
-) -> list[ClaimChange]:
-    """Return the valid claims that people added or edited, each with the last valid one before."""
-    paths = {
-        path
-        for commit in commit_log.person_commits(repo, to, last_valid_commit)
-        for path in changed_files(trees.parent_tree(commit), commit.tree)
-    }
-    tree = trees.commit_of(repo, to).tree
-    written = {
-        path: claim
-        for path in sorted(paths)
-        if (claim := valid_claim_at(tree, path)) and in_effect.get(claim.key) != claim
-    }
-    booked = last_valid_claims(repo, last_valid_commit, to, written)
-    changes = (ClaimChange(booked[path], claim) for path, claim in written.items())
-    return [change for change in changes if change.before != change.after]
 
 
 def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:

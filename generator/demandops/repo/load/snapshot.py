@@ -1,88 +1,157 @@
-"""A commit's configuration and ledger, and the state in effect if some files are not valid.
+"""What is in effect at a commit: its ledger, and the configuration of one commit.
 
-:func:`load` reads all files, :func:`advance` only those that changed. If a file is not valid, its
-last valid version stays in effect and the file is reported.
+If the configuration of a commit is valid, with its ledger, it is in effect. If not, that of the
+newest commit found valid stays in effect, as a whole, until a commit is valid. Commits of a
+generator say so in the trailer ``Configuration``; without it, their own configuration is in effect.
+So a start, every reader and `demandops verify` find the same, by the history alone.
+
+The ledger is always that of the commit. A claim in it that is not valid, or that no demand could
+have booked, is put back by the generator, like a generated file that a person has edited.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import chain, takewhile
-from urllib.parse import quote, unquote
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from types import MappingProxyType
+from typing import NamedTuple
 
-from pygit2 import Blob, GitError, Oid, Repository, Tree
+from pygit2 import Blob, Commit, Oid, Repository, Tree
 
+from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, OverLimit, StateRepoError, fault
-from demandops.base.naming import Subject
-from demandops.base.settings import GENERATED_ROOTS
-from demandops.decide.edits import changeset_of_edit, faults_of_edit
+from demandops.base.quoting import one_line
+from demandops.base.settings import GENERATED_ROOTS, RENDER_VERSION
+from demandops.base.strict_yaml import with_lines
+from demandops.decide import edits
+from demandops.decide.changeset import Change, Changeset, ReleaseChange
 from demandops.decide.state import State, rendered_files, try_configuration
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.load import load as load_config
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
-from demandops.model.ledger.claim import Claim
-from demandops.model.ledger.ledger import ClaimChange, Ledger
+from demandops.model.ledger.claim import Claim, ClaimKey
+from demandops.model.ledger.ledger import ClaimChange, Ledger, claim_changes
 from demandops.repo.git import tree as trees
-from demandops.repo.git.repository import StateRepository
 from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry
-from demandops.repo.load import last_valid_config, ledger_files
-from demandops.repo.load.last_valid_config import ConfigSource, LastValidConfig
+from demandops.repo.load import ledger_files
 from demandops.templating.evaluator import DEMAND_S, EVALUATE, processor_time
 
 Progress = Callable[[int, int], None]
+Files = Mapping[str, str | None]
+# The ids of the files and folders of a configuration: equal ids, equal content.
+ConfigIds = tuple[Oid | None, ...]
 
-# The folders and files that a snapshot is read from.
-ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT)
+NO_STATE_REPO = (
+    "this is not a state repo, because it has no demandops.yaml; if the file was deleted, restore "
+    "it; `demandops init DIR` makes a new state repo"
+)
+# The trailer that names the commit whose configuration is in effect instead of the commit's own.
+CONFIGURATION = "Configuration"
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
     commit: Oid
     state: State
-    last_valid_commit: Oid  # the newest commit without problems
-    # the faults of invalid files, whose last valid versions are in effect
-    problems: tuple[Fault, ...] = ()
-    # ledger files whose content at this commit is not in effect
-    quarantined_files: tuple[str, ...] = ()
-    # the source of the configuration in effect; None means this commit
-    other_config_source: ConfigSource | None = None
+    # the commit whose configuration is in effect; ``commit`` itself unless its own is not valid
+    configuration: Oid
+    # why the configuration of ``commit`` is not in effect, and its ids, which are not judged again
+    faults: tuple[Fault, ...] = ()
+    refused: ConfigIds | None = None
+    # the configuration that the newest commit of a generator says is not in effect
+    told: ConfigIds | None = None
+    # files of claims that are not valid at ``commit`` → the claims in effect instead, and why
+    put_back: Mapping[str, Claim | None] = field(default_factory=dict)
+    claim_faults: tuple[Fault, ...] = ()
     # whether a generator has written the files of this state; if not, all must be rendered
     is_rendered: bool = True
 
     @property
-    def config_source(self) -> ConfigSource:
-        return self.other_config_source or ConfigSource(self.commit)
+    def is_settled(self) -> bool:
+        """Whether nothing is left to judge, to render or to put back."""
+        is_judged = bool(self.faults) or self.told is None
+        return self.is_rendered and not self.put_back and is_judged
+
+    @property
+    def problems(self) -> tuple[Fault, ...]:
+        return (*self.faults, *self.claim_faults)
+
+    @property
+    def trailers(self) -> list[tuple[str, str]]:
+        return [(CONFIGURATION, str(self.configuration))] if self.faults else []
 
 
-@dataclass(frozen=True, slots=True)
-class Advance:
-    snapshot: Snapshot
-    subjects: tuple[Subject, ...]  # those whose claims changed
-    # all releases must be rendered again, usually because the configuration changed
-    config_changed: bool
+# ---- the files of one commit ----
+
+
+def config_ids(tree: Tree) -> ConfigIds:
+    return tuple(trees.entry_id(tree, root) for root in CONFIG_ROOTS)
+
+
+def config_at(tree: Tree) -> Config:
+    files = trees.texts(tree, CONFIG_ROOTS)
+    if ROOT_FILE not in files:
+        raise StateRepoError(NO_STATE_REPO)
+    return load_config(files)
+
+
+def end_markers_at(tree: Tree) -> dict[str, str]:
+    return trees.texts(tree, (records.MARKERS_ROOT,))
 
 
 def load(
-    repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
+    repo: Repository,
+    revision: str | Oid,
+    progress: Progress = lambda done, total: None,
+    entry: LogEntry | None = None,
 ) -> Snapshot:
-    # ``progress`` gets the numbers of read and of all claim files
+    """Read all files of a commit, and with ``entry`` the configuration that the commit names.
+
+    InvalidInput is raised if that configuration is not valid.
+    """
     commit = trees.commit_of(repo, revision)
-    config = last_valid_config.config_at(commit.tree)
-    files = ledger_files.read_claims(_claim_texts(commit.tree, progress))
-    if files.faults:
-        raise InvalidInput(files.faults)
-    ended = last_valid_config.ended_overrides_at(commit.tree)
-    waits = records.read_all_waiting(trees.texts(commit.tree, (records.WAITING_ROOT,)))
-    ledger = replace(files.ledger(), ended=ended, waiting=waits)
-    return Snapshot(commit.id, State(config, ledger, EVALUATE), commit.id)
+    tree, configuration = commit.tree, configuration_of(repo, commit, entry)
+    config = config_at(trees.commit_of(repo, configuration).tree)
+    ledger, put_back, faults = ledger_at(repo, commit, progress, entry)
+    told = None if configuration == commit.id else config_ids(tree)
+    state = State(config, ledger, EVALUATE)
+    return Snapshot(
+        commit.id, state, configuration, told=told, put_back=put_back, claim_faults=tuple(faults)
+    )
+
+
+def ledger_at(
+    repo: Repository,
+    commit: Commit,
+    progress: Progress = lambda done, total: None,
+    entry: LogEntry | None = None,
+) -> tuple[Ledger, dict[str, Claim | None], list[Fault]]:
+    """Return the ledger, with what is in effect for files of claims that are not valid."""
+    put_back, faults = dict[str, Claim | None](), list[Fault]()
+    # the second version put no claim back, and named those that were not in effect
+    held_back = entry.trailers.get("Held-Back", ()) if entry else ()
+    ledger = Ledger()
+    for path, text in _claim_texts(commit.tree, progress):
+        try:
+            claim: Claim | None = claim_files.read(text, path)
+            if path in held_back:
+                raise InvalidInput([fault("", "no demand could have booked this").within(path)])
+        except InvalidInput as error:
+            faults += error.faults
+            put_back[path] = claim = ledger_files.as_last_written(repo, commit.id, path)
+        if claim is not None:
+            ledger = ledger.replace(claim.key, claim)
+    ended = records.read_ended_override(end_markers_at(commit.tree))
+    return replace(ledger, ended=ended, waiting=_waiting(commit.tree)), put_back, faults
 
 
 def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
+    # ``progress`` gets the numbers of read and of all claim files
     blobs: list[tuple[str, Blob]] = [
         (path, blob)
         for path, blob in trees.blobs(tree, (claim_files.LEDGER_ROOT,))
@@ -95,415 +164,440 @@ def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
     progress(len(blobs), len(blobs))
 
 
-def advance(
-    repo: Repository, before: Snapshot, to: Oid, recorded: ConfigSource | None = None
-) -> Advance:
-    """Return the snapshot of the commit ``to``, and the changes since the snapshot ``before``.
-
-    Only files that differ are read. ``recorded`` is the recorded source of the configuration in
-    effect at ``to``; if its files are not valid, InvalidInput is raised.
-    """
-    old, new = trees.commit_of(repo, before.commit).tree, trees.commit_of(repo, to).tree
-    state, in_effect = before.state, LastValidConfig(None, before.config_source, ())
-    if recorded is not None:
-        in_effect = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
-    elif before.problems or trees.differ(old, new, CONFIG_ROOTS):
-        in_effect = _last_valid_config(repo, before, to)
-    config, ended = in_effect.config or state.config, last_valid_config.ended_overrides_at(new)
-    world_changed = config != state.config or ended != state.ledger.ended
-    config_changed = (
-        world_changed or not before.is_rendered or _must_render_all(repo, before.commit, to)
-    )
-    waits = state.ledger.waiting
-    if trees.differ(old, new, (records.WAITING_ROOT,)):
-        waits = records.read_all_waiting(trees.texts(new, (records.WAITING_ROOT,)))
-    ledger = replace(state.ledger, ended=ended, waiting=waits)
-    state = State(config, ledger, EVALUATE) if in_effect.config else replace(state, ledger=ledger)
-    problems, claims, invalid = list(in_effect.faults), dict[str, Claim | None](), list[str]()
-    # a quarantined file is read again, because another change may have made it valid
-    for path in sorted({*ledger_files.changed_files(old, new), *before.quarantined_files}):
-        try:
-            claims[path] = claim = ledger_files.claim_at(new, path)
-            # the owner of a path is sought in the whole ledger, and only of a replaced file
-            if trees.entry(old, path) and (
-                faults := list(ledger_files.owner_faults(claim, path, state.ledger))
-            ):
-                raise InvalidInput(faults)
-        except InvalidInput as error:
-            problems += error.faults
-            invalid.append(path)
-    claims |= ledger_files.last_valid_claims(repo, before.last_valid_commit, to, invalid)
-    ledger, changes = state.ledger, list[ClaimChange]()
-    for path in sorted(claims):
-        claim = claims[path]
-        keyed = claim or ledger_files.valid_claim_at(old, path)
-        key = keyed.key if keyed else ledger_files.key_of(path, ledger)
-        if key is not None and ledger.get(key) != claim:
-            changes.append(ClaimChange(ledger.get(key), claim))
-            ledger = ledger.replace(key, claim)
-    if world_changed:
-        state = replace(state, ledger=ledger)
-    else:
-        state = before.state.with_ledger(ledger, changes)
-    snapshot = Snapshot(
-        to,
-        state,
-        before.last_valid_commit if problems else to,
-        tuple(problems),
-        tuple(invalid),
-        in_effect.source if in_effect.faults or recorded else None,
-    )
-    subjects = dict.fromkeys(change.key.subject for change in changes)
-    return Advance(snapshot, tuple(subjects), config_changed)
+def _waiting(tree: Tree) -> records.WaitingDemands:
+    return records.read_all_waiting(trees.texts(tree, (records.WAITING_ROOT,)))
 
 
-def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
-    # people may have changed generated files since ``before``
-    people = list(commit_log.person_commits(repo, to, before))
-    # where a generator made the newest commit, the generated files match the ledger
-    if not people or people[0].id != to:
-        return False
-    # a person's commit may undo what another generator has committed meanwhile
-    is_alone = len(people) == sum(1 for _ in commit_log.commits(repo, to, before))
-    roots = GENERATED_ROOTS if is_alone else (*GENERATED_ROOTS, *ROOTS)
-    return any(
-        trees.differ(commit.parents[0].tree, commit.tree, roots)
-        for commit in people
-        if commit.parents
-    )
-
-
-# By their arguments, the newest results of _last_valid_config: an invalid file is judged only once,
-# and not again for each demand.
-_judged: dict[object, LastValidConfig] = {}
-_MOST_JUDGED = 8
-
-
-def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValidConfig:
-    key = (
-        frozenset(before.config_source.files(repo).items()),
-        frozenset(ConfigSource(to).files(repo).items()),
-        before.last_valid_commit,
-        frozenset(before.state.ledger.ended.items()),
-    )
-    result = _judged.get(key)
-    if result is None:
-        result = last_valid_config.load_last_valid_config(
-            repo,
-            before.config_source,
-            before.last_valid_commit,
-            to,
-            lambda files: _load_and_rehearse(files, before.state),
+def configuration_of(repo: Repository, commit: Commit, entry: LogEntry | None) -> Oid:
+    # in the second version, ``In-Force`` named the newest commit where all files were valid
+    named = (entry.first("In-Force") or entry.first(CONFIGURATION)) if entry else ""
+    if not named:
+        return commit.id
+    found = trees.commit_of(repo, named).id
+    if _on_line(repo, commit.id, found) != found:
+        raise StateRepoError(
+            f"commit {commit.id} names {named} as its configuration, which is no commit before it; "
+            "set the branch back to the commit before it"
         )
-        if len(_judged) >= _MOST_JUDGED:
-            _judged.clear()
-        _judged[key] = result
-    # a result may be of another commit with the same files
-    if result.config is None:
-        return replace(result, source=before.config_source)
-    return replace(result, source=replace(result.source, commit=to))
+    return found
 
 
-def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
-    if ROOT_FILE not in files:
-        raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
-    config, in_force = load_config(files), state.config.repo_settings.render_version
-    if config.repo_settings.render_version < in_force:
-        message = f"is lower than {in_force}, which `demandops upgrade` wrote; write {in_force}"
-        raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
-    if config != state.config:  # a new one must render samples
-        # what takes too long is a fault for `check`, and of each demand that needs it; whether a
-        # configuration is valid must not depend on the machine
-        with suppress(OverLimit), processor_time(each=DEMAND_S, together=4 * DEMAND_S):
-            try_configuration(State(config, Ledger(ended=state.ledger.ended), EVALUATE))
-    return config
+def _on_line(repo: Repository, to: Oid, configuration: Oid) -> Oid | None:
+    """Return ``configuration``, or if people have rewritten main, a commit with the same files.
+
+    People merge only what they have looked at, so a commit counts if it was main once: it is along
+    the first parents, or a generator's.
+    """
+    wanted, same = trees.commit_of(repo, configuration), None
+    ids = config_ids(wanted.tree)
+    for commit in commit_log.first_parents(repo, to):
+        if commit.id == configuration:
+            return configuration
+        if same is None and config_ids(commit.tree) == ids:
+            same = commit.id
+    if repo.descendant_of(to, configuration) and commit_log.is_by_generator(repo, wanted):
+        return configuration
+    return same
 
 
-class ReadAhead:
-    # Reading takes time. If each attempt to publish read all commits since this generator's last
-    # publication, and not only the newer ones, other generators could publish first every time.
-    def __init__(self) -> None:
-        self._so_far: Advance | None = None
-        self._start: Oid | None = None
-
-    def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        last_valid_config.refuse_other_render_version(repo, tip)
-        so_far = self._so_far
-        if so_far is None or self._start != before.commit:
-            so_far = Advance(before, (), False)
-        start = so_far.snapshot
-        if start.commit != tip or start.problems or not start.is_rendered:
-            later = advance(repo, start, tip)
-            so_far = Advance(
-                later.snapshot,
-                tuple(dict.fromkeys((*so_far.subjects, *later.subjects))),
-                so_far.config_changed
-                or later.config_changed
-                or (start.commit != before.commit and _must_render_all(repo, before.commit, tip)),
-            )
-        self._so_far, self._start = so_far, before.commit
-        return so_far
+def refuse_other_render_version(repo: Repository, commit: Oid) -> None:
+    """Raise StateRepoError if a program of another render version serves the state repo."""
+    # generators of two render versions would undo each other's changes
+    try:
+        text = trees.read_text(trees.commit_of(repo, commit).tree, ROOT_FILE)
+        data = strict_yaml.load(text or "")
+    except InvalidInput:
+        return
+    version = data.get("renderVersion") if isinstance(data, dict) else None
+    if type(version) is not int or version == RENDER_VERSION:
+        return
+    # A version that no program ever wrote here is a person's mistake, and not in effect like any
+    # other. Else one merge would stop all demands.
+    if not commit_log.was_rendered_with(repo, commit, version):
+        return
+    remedy = "update the generator"
+    if version < RENDER_VERSION:
+        remedy = "stop older generators, then run `demandops upgrade` to render everything again"
+    raise StateRepoError(
+        f"{ROOT_FILE}: renderVersion: is {version}, but this generator renders version "
+        f"{RENDER_VERSION}; {remedy}"
+    )
 
 
-# ---- the state in effect at a commit, even if some files are not valid ----
-#
-# While some files are not valid, the generator's commits record this state in trailers. ``In-
-# Force`` names the newest commit where all files were valid. ``Configuration`` names the commit
-# whose configuration is in effect. Each ``Stands-In`` names a file that is in effect in another
-# version, as path and blob. Each ``Held-Back`` names a file of the ledger that is not in effect. A
-# restart and `demandops verify` start from these trailers. They then apply people's later changes
-# with the same code as a running generator.
-#
-# If a person's change of a claim is refused or cannot be planned, for example because the claim
-# names an unknown node, the change is quarantined: the generator leaves the file alone, but the
-# file's last valid version is in effect. If the new configuration is at fault, the old
-# configuration stays in effect.
-
-_NONE = "none"
-_HELD_BACK = "Held-Back"
-# A placeholder for the problems of a recorded state, until the files are checked again.
-_TO_CHECK = Fault("invalid", "", "must be checked again")
+# ---- from a generator's newest commit to people's commits after it ----
 
 
-def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
-    if not snapshot.problems:
-        return []
-    source = snapshot.config_source
-    return [
-        ("In-Force", str(snapshot.last_valid_commit)),
-        ("Configuration", str(source.commit)),
-        *(
-            # quoted, so that a space in a path does not begin the blob
-            ("Stands-In", f"{quote(path)} {blob or _NONE}")
-            for path, blob in sorted(source.replacements.items())
-        ),
-        *((_HELD_BACK, path) for path in sorted(snapshot.quarantined_files)),
-    ]
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """What is in effect after people's commits, and what carries them out."""
+
+    snapshot: Snapshot
+    # at the newest commit of a generator, from which people's commits were read
+    before: Snapshot
+    change: Changeset = field(default_factory=lambda: Changeset({}, ()))
+    # the claims that overrides changed, or that were put back
+    keys: tuple[ClaimKey, ...] = ()
+
+    @property
+    def must_commit(self) -> bool:
+        # also to say which configuration is in effect
+        now = self.snapshot
+        return bool(self.change.files) or now.told != (now.refused if now.faults else None)
 
 
-def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
-    # the caller then follows people's later changes
-    objects, tip = repository.objects, repository.tip()
-    last_valid_config.refuse_other_render_version(objects, tip)
-    return start_at(objects, tip, progress)
+def start_at(repo: Repository, tip: Oid, progress: Progress = lambda done, total: None) -> Snapshot:
+    """Return what the newest commit of a generator has in effect, else the tip if it is valid."""
+    told: InvalidInput | StateRepoError | None = None
+    for commit in repo.walk(tip):
+        if commit_log.is_by_generator(repo, commit):
+            # it may be forged, or of a newer program
+            try:
+                return load(repo, commit.id, progress, commit_log.entry_of(commit))
+            except (InvalidInput, StateRepoError) as error:
+                told = error
+            break
+    try:
+        return replace(load(repo, tip, progress), is_rendered=False)
+    except (InvalidInput, StateRepoError) as error:
+        raise told or error from None
 
 
 def state_at(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    # InvalidInput or StateRepoError is raised if there never was a valid state
+    """Return what is in effect at a commit, as soon as a generator has followed it."""
     commit = trees.commit_of(repo, revision)
-    return state_after(repo, start_at(repo, commit.id, progress), commit.id)
+    start = start_at(repo, commit.id, progress)
+    # the overrides that have ended are those that had ended at the time of the commit
+    return follow(repo, start, commit.id, commit_log.time_of(commit)).snapshot
 
 
-def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
-    if start.commit == to:
-        return start
-    commit, change = trees.commit_of(repo, to), advance(repo, start, to)
-    judgement = judge(repo, change, start, commit.tree)
-    accepted = judgement.with_new_config().snapshot
-    try:
-        if change.config_changed:
-            rendered_files(
-                accepted.state, trees.texts(commit.tree, GENERATED_ROOTS), keeps_late=True
-            )
-    except InvalidInput as error:
-        accepted = judgement.with_old_config(error.faults).snapshot
-    return accepted
+def follow(
+    repo: Repository, before: Snapshot, to: Oid, now: datetime, *, again: bool = False
+) -> Followed:
+    """Return what is in effect at the commit ``to``, and the files that a generator must write.
 
-
-def start_at(
-    repo: Repository, commit: Oid, progress: Progress = lambda done, total: None
-) -> Snapshot:
-    """Return the state in effect that the generator's newest commit up to ``commit`` records.
-
-    If the record is missing or wrong, return the state of the newest commit with only valid files
-    up to the generator's commit or, if there is none, up to ``commit``.
+    Only files that differ are read. A configuration that was not valid is judged ``again`` only if
+    asked, as it may be valid once a claim has ended.
     """
-    record = record_at(repo, commit)
-    tried, faults = set[tuple[Oid | None, ...]](), list[InvalidInput | StateRepoError]()
-    if record.first("In-Force"):
-        # the record may be forged, or name commits that people have removed from the history
-        with suppress(InvalidInput, StateRepoError):
-            return recorded_state(repo, record, progress)
-    line = commit_log.first_parents(repo, commit)
-    newer = list(takewhile(lambda by_person: str(by_person.id) != record.commit, line))
-    for ancestor in chain(commit_log.first_parents(repo, record.commit), newer):
-        content = tuple(trees.entry_id(ancestor.tree, root) for root in ROOTS)
-        if content not in tried:  # most commits change other files, and loading takes time
-            tried.add(content)
+    for commit, entry in commit_log.commits(repo, to, before.commit):
+        if entry.by_generator and commit_log.is_by_generator(repo, commit):
             try:
-                snapshot = load(repo, ancestor.id, progress)
-                return replace(snapshot, is_rendered=ancestor not in newer)
-            except (InvalidInput, StateRepoError) as error:
-                faults.append(error)
-    raise faults[0]
-
-
-def snapshot_at(
-    repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
-) -> Snapshot:
-    # unlike state_at, this fails if a file is not valid and no generator has quarantined it
-    if record_at(repo, revision).first("In-Force"):
-        return state_at(repo, revision, progress)
-    return load(repo, revision, progress)
-
-
-def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
-    """Return the generator's newest commit, else the revision's own commit without trailers."""
-    commit = trees.commit_of(repo, revision)
-    last = commit_log.last_generator_commit(repo, commit.id)
-    if last is None:
-        return replace(commit_log.entry_of(commit), trailers={})
-    return commit_log.entry_of(trees.commit_of(repo, last))
-
-
-def recorded_state(
-    repo: Repository, record: LogEntry, progress: Progress = lambda done, total: None
-) -> Snapshot:
-    commit = trees.commit_of(repo, record.commit)
-    if not record.first("In-Force"):
-        return load(repo, commit.id, progress)
-    last_valid = load(repo, record.first("In-Force"), progress)
-    configuration = record.first("Configuration") or record.first("In-Force")
-    replacements: dict[str, Oid | None] = {}
-    try:
-        for line in record.trailers.get("Stands-In", ()):
-            path, _, blob = line.rpartition(" ")
-            replacements[unquote(path)] = None if blob == _NONE else repo[blob].peel(Blob).id
-        source = ConfigSource(Oid(hex=configuration), replacements)
-    except (ValueError, KeyError, GitError):
+                before = _taken_over(repo, before, commit, entry)
+            except StateRepoError as refused:  # unless people have put this right since
+                try:
+                    before = replace(load(repo, to), is_rendered=False)
+                except (InvalidInput, StateRepoError):
+                    raise refused from None
+            break
+    if before.commit == to and before.is_settled and not again:
+        return Followed(before, before)
+    ids = config_ids(trees.commit_of(repo, to).tree)
+    in_effect = trees.commit_of(repo, before.configuration)
+    if ids == config_ids(in_effect.tree):
+        return _carried_out(
+            repo, before, replace(before, commit=to, configuration=to, faults=(), refused=None), now
+        )
+    faults = before.faults
+    if ids != before.refused or again:
+        try:
+            config = _judged(trees.commit_of(repo, to).tree, before.state)
+            state = replace(before.state, config=config)
+            return _carried_out(repo, before, Snapshot(to, state, to, told=before.told), now)
+        except InvalidInput as error:
+            faults = error.faults
+    configuration = _on_line(repo, to, before.configuration)
+    if configuration is None:
         raise StateRepoError(
-            f"commit {record.commit} has unreadable trailers about invalid files; revert it, or "
-            "merge valid files"
-        ) from None
-    change = advance(repo, last_valid, commit.id, source)
-    held_back = record.trailers.get(_HELD_BACK, ())
-    judgement = judge(repo, change, last_valid, commit.tree, held_back)
-    snapshot = judgement.with_new_config().snapshot
-    problems = snapshot.problems or (_TO_CHECK,)
-    return replace(snapshot, last_valid_commit=last_valid.commit, problems=problems)
-
-
-Faults = Mapping[Subject, tuple[Fault, ...]]
-
-
-@dataclass(frozen=True, slots=True)
-class Judgement:
-    # of people's changes with the new and with the old configuration, by subject
-    repo: Repository
-    before: Snapshot
-    advance: Advance
-    with_new: Faults  # why a subject cannot be planned with the new configuration
-    with_old: Faults  # why a subject cannot be planned, or is refused, with the old configuration
-    refused: Faults  # why a person's claim on the subject is refused with the new configuration
-    old: State  # the configuration that was in effect before, with the new ledger
-
-    def with_new_config(self) -> Advance:
-        # with the last valid versions of claims at fault; what has a fault only with the new
-        # configuration is not the claims' fault
-        faults = {
-            subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
-        }
-        return self._quarantined(self.advance, _merged(faults, self.refused))
-
-    def with_old_config(self, faults: Iterable[Fault]) -> Advance:
-        accepted = self.with_new_config()
-        ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
-        snapshot = replace(
-            accepted.snapshot,
-            state=replace(self.old, ledger=ledger),
-            problems=(*problems, *faults),
-            last_valid_commit=self.before.last_valid_commit,
-            other_config_source=self.before.config_source,
+            f"main was rewritten, its configuration is not valid ({faults[0]}), and no commit of "
+            "it has the one that was in effect; correct the file, or set main back"
         )
-        return self._quarantined(replace(accepted, snapshot=snapshot), self.with_old)
-
-    def _quarantined(self, accepted: Advance, faults: Faults) -> Advance:
-        snapshot, before = accepted.snapshot, self.before
-        problems, ledger = list(snapshot.problems), snapshot.state.ledger
-        quarantined = dict.fromkeys(snapshot.quarantined_files)
-        for subject in (subject for subject in accepted.subjects if subject in faults):
-            claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
-            keys = {claim_files.path_of(claim.key): claim.key for claim in claims}
-            # a fault outside claim files is told at a claim on the subject, best at a changed one
-            now = snapshot.state.ledger.claims_on(subject)
-            changed = [claim for claim in now if before.state.ledger.get(claim.key) != claim]
-            paths = [claim_files.path_of(claim.key) for claim in (changed or now)]
-            problems += [
-                fault.within(paths[0])
-                if paths and claim_files.kind_of(fault.file) is None
-                else fault
-                for fault in faults[subject]
-            ]
-            last_valid = ledger_files.last_valid_claims(
-                self.repo, before.last_valid_commit, snapshot.commit, keys
-            )
-            for path, key in keys.items():
-                ledger = ledger.replace(key, last_valid[path])
-            quarantined |= dict.fromkeys(keys)
-        snapshot = replace(
-            snapshot,
-            state=replace(snapshot.state, ledger=ledger),
-            problems=tuple(problems),
-            last_valid_commit=before.last_valid_commit if problems else snapshot.commit,
-            quarantined_files=tuple(quarantined),
-        )
-        good = tuple(subject for subject in accepted.subjects if subject not in faults)
-        return replace(accepted, snapshot=snapshot, subjects=good)
+    held = replace(before, commit=to, configuration=configuration, faults=faults, refused=ids)
+    return _carried_out(repo, before, held, now)
 
 
-def judge(
-    repo: Repository,
-    advance: Advance,
-    before: Snapshot,
-    tree: Tree,
-    held_back: Collection[str] | None = None,
-) -> Judgement:
-    """Return the judgement of people's changes, from the snapshot ``before`` to ``advance``.
+def with_started_leases(repo: Repository, followed: Followed, now: datetime) -> Followed:
+    # an approved claim's lease starts only now, because else it could end before the approval
+    snapshot, files = followed.snapshot, dict(followed.change.files)
+    ledger = snapshot.state.ledger
+    for claim in ledger.unstarted_claims():
+        assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
+        path = claim_files.path_of(claim.key)
+        earlier = ledger_files.lease_before_approval(repo, snapshot.commit, path)
+        started = replace(claim, lease=claim.lease.started(now, earlier))
+        ledger = ledger.replace(claim.key, started)
+        files[path] = claim_files.text_of(started)
+    # a lease does not affect a release, so the usage of nodes need not be counted again
+    snapshot = replace(snapshot, state=snapshot.state.with_ledger(ledger, ()))
+    return replace(followed, snapshot=snapshot, change=replace(followed.change, files=files))
 
-    ``tree`` has the current generated files. ``held_back`` are the claim files that a generator's
-    commit records as not in effect; without them, it is decided anew which claims are refused.
-    """
-    state, ledger = advance.snapshot.state, before.state.ledger
-    old = replace(before.state, ledger=state.ledger)
 
-    def faults_in(state: State) -> Faults:
-        faults = {}
-        for subject in advance.subjects:
-            try:
-                changeset_of_edit(
-                    state, ledger, [subject], lambda path: trees.read_text(tree, path)
+def _taken_over(repo: Repository, before: Snapshot, commit: Commit, entry: LogEntry) -> Snapshot:
+    # What another generator has published is right, so nothing of it is judged or rendered again.
+    configuration = configuration_of(repo, commit, entry)
+    tree, source = commit.tree, trees.commit_of(repo, configuration).tree
+    config = before.state.config
+    if config_ids(source) != config_ids(trees.commit_of(repo, before.configuration).tree):
+        try:
+            config = config_at(source)
+        except InvalidInput as error:
+            raise StateRepoError(
+                f"another generator has the configuration of commit {configuration} in effect, "
+                f"which is not valid for this program ({error.faults[0]}); update this generator"
+            ) from None
+    read = _ledger_after(repo, before, commit)
+    is_own = configuration == commit.id
+    return Snapshot(
+        commit.id,
+        read.state_with(before.state, config),
+        configuration,
+        () if is_own else before.faults,
+        None if is_own else before.refused,
+        None if is_own else config_ids(tree),
+        read.put_back,
+        tuple(read.faults),
+    )
+
+
+class _LedgerRead(NamedTuple):
+    ledger: Ledger
+    changes: list[ClaimChange]
+    put_back: dict[str, Claim | None]
+    faults: list[Fault]
+
+    def state_with(self, before: State, config: Config) -> State:
+        if config == before.config and self.ledger.ended == before.ledger.ended:
+            return before.with_ledger(self.ledger, self.changes)
+        return State(config, self.ledger, EVALUATE)
+
+
+def _ledger_after(repo: Repository, before: Snapshot, commit: Commit) -> _LedgerRead:
+    old, new = trees.commit_of(repo, before.commit).tree, commit.tree
+    ledger = replace(before.state.ledger, ended=records.read_ended_override(end_markers_at(new)))
+    if trees.differ(old, new, (records.WAITING_ROOT,)):
+        ledger = replace(ledger, waiting=_waiting(new))
+    changes, put_back, faults = (
+        list[ClaimChange](),
+        dict(before.put_back),
+        list(before.claim_faults),
+    )
+    for path in ledger_files.changed_files(old, new):
+        was = before.put_back.get(path) or ledger_files.valid_claim_at(old, path)
+        put_back.pop(path, None)
+        try:
+            claim = ledger_files.claim_at(new, path)
+            if conflict := list(ledger_files.owner_faults(claim, was, path)):
+                raise InvalidInput(conflict)
+        except InvalidInput as error:
+            faults += error.faults
+            put_back[path] = claim = was or ledger_files.as_last_written(repo, commit.id, path)
+        if claim != was and (key := (claim or was)) is not None:
+            changes.append(ClaimChange(was, claim))
+            ledger = ledger.replace(key.key, claim)
+    return _LedgerRead(ledger, changes, put_back, faults)
+
+
+# By the ids of their files, the newest configurations that were judged.
+_judgements: dict[object, Config | InvalidInput] = {}
+_MOST_JUDGED = 8
+
+
+def _judged(tree: Tree, before: State) -> Config:
+    """Return the configuration of people's commit if it can be used, whatever is demanded."""
+    in_effect = before.config.repo_settings.render_version
+    key = (config_ids(tree), in_effect, frozenset(before.ledger.ended.items()))
+    if key not in _judgements:
+        try:
+            files = trees.texts(tree, CONFIG_ROOTS)
+            if ROOT_FILE not in files:
+                raise InvalidInput([fault("", NO_STATE_REPO).within(ROOT_FILE)])
+            config = load_config(files)
+            if config.repo_settings.render_version < in_effect:
+                message = (
+                    f"is lower than {in_effect}, which `demandops upgrade` wrote; write {in_effect}"
                 )
-            except InvalidInput as error:
-                faults[subject] = error.faults
-        return faults
-
-    start, commit = before.last_valid_commit, advance.snapshot.commit
-    by_people = list[ClaimChange]()
-    if held_back is None and advance.subjects:
-        by_people = ledger_files.claims_by_people(repo, start, commit, ledger)
-
-    def refused_in(state: State) -> Faults:
-        refused: dict[Subject, tuple[Fault, ...]] = {}
-        for change in by_people:
-            faults = tuple(faults_of_edit(before.state, state, [change]))
-            if faults:
-                refused[change.key.subject] = (*refused.get(change.key.subject, ()), *faults)
-        return refused
-
-    with_new, refused = faults_in(state), refused_in(state)
-    if held_back is not None:
-        refused = {
-            subject: (_TO_CHECK,)
-            for subject in advance.subjects
-            if any(claim_files.path_of(c.key) in held_back for c in state.ledger.claims_on(subject))
-        }
-    if state.config == old.config:
-        return Judgement(repo, before, advance, with_new, with_new, refused, old)
-    with_old = _merged(faults_in(old), refused_in(old))
-    return Judgement(repo, before, advance, with_new, with_old, refused, old)
+                raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
+            if config != before.config:  # a new one must render samples
+                # what takes too long is a fault for `check`, and of each demand that needs it;
+                # whether a configuration is valid must not depend on the machine
+                with suppress(OverLimit), processor_time(each=DEMAND_S, together=4 * DEMAND_S):
+                    try_configuration(State(config, Ledger(ended=before.ledger.ended), EVALUATE))
+            judgement: Config | InvalidInput = config
+        except InvalidInput as error:
+            judgement = error
+        if len(_judgements) >= _MOST_JUDGED:
+            _judgements.clear()
+        _judgements[key] = judgement
+    judgement = _judgements[key]
+    if isinstance(judgement, InvalidInput):
+        raise InvalidInput(judgement.faults)
+    return judgement
 
 
-def _merged(one: Faults, other: Faults) -> Faults:
-    return {subject: (*one.get(subject, ()), *other.get(subject, ())) for subject in {*one, *other}}
+def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: datetime) -> Followed:
+    """Return the effect of people's commits with the configuration of ``wanted``.
+
+    InvalidInput is raised if a release cannot be planned or rendered with it.
+    """
+    commit, old = trees.commit_of(repo, wanted.commit), before.state
+    tree = commit.tree
+    read = _ledger_after(repo, before, commit)
+    state = read.state_with(old, wanted.state.config)
+    renders_all = (
+        state.config != old.config
+        or state.ledger.ended != old.ledger.ended
+        or not before.is_rendered
+        or trees.differ(trees.commit_of(repo, before.commit).tree, tree, GENERATED_ROOTS)
+    )
+
+    def carry_out(
+        state: State, changes: Iterable[ClaimChange]
+    ) -> tuple[State, Changeset, tuple[ClaimKey, ...]]:
+        subjects = tuple(dict.fromkeys(change.key.subject for change in changes))
+        if renders_all:
+            markers = end_markers_at(tree)
+            applied = edits.update_ledger(old, state, subjects, markers, now)
+            state = replace(state, ledger=applied.ledger)
+            return state, render_all(tree, state, applied.files), tuple(applied.keys)
+        applied = edits.update_claims(old.ledger, state, subjects, now)
+        touched = claim_changes(state.ledger, applied.ledger, applied.keys)
+        state = state.with_ledger(applied.ledger, touched)
+        subjects = tuple(dict.fromkeys((*subjects, *(edit.key.subject for edit in touched))))
+        change = edits.changeset_of_edit(
+            state, old.ledger, subjects, lambda path: trees.read_text(tree, path)
+        )
+        return state, replace(change, files={**applied.files, **change.files}), tuple(applied.keys)
+
+    # claims that no demand could have booked, or that cannot be planned, are put back
+    kept, refused, faults = list[ClaimChange](), list[ClaimChange](), list(read.faults)
+    for change in read.changes:
+        found = _faults_of(change, old, state, tree)
+        faults += found
+        (refused if found else kept).append(change)
+    state = _without(state, refused)
+    try:
+        state, carried, keys = carry_out(state, kept)
+    except InvalidInput as error:
+        # with the configuration that was in effect, only what people did to the ledger can fail
+        if state.config != old.config or not kept:
+            raise
+        faults += error.faults
+        state, refused = _without(state, kept), [*refused, *kept]
+        state, carried, keys = carry_out(state, ())
+    put_back = read.put_back | {
+        claim_files.path_of(change.key): change.before for change in refused
+    }
+    files: dict[str, str | None] = {
+        **{path: claim_files.text_of(claim) if claim else None for path, claim in put_back.items()},
+        **carried.files,
+    }
+    snapshot = replace(
+        wanted,
+        state=state,
+        put_back=put_back,
+        claim_faults=tuple(faults),
+        is_rendered=True,
+    )
+    named = (*keys, *(claim.key for claim in put_back.values() if claim))
+    return Followed(snapshot, before, replace(carried, files=files), named)
+
+
+def _faults_of(change: ClaimChange, old: State, state: State, tree: Tree) -> list[Fault]:
+    if found := list(edits.faults_of_edit(old, state, [change])):
+        return found
+    try:
+        edits.changeset_of_edit(
+            state, old.ledger, [change.key.subject], lambda path: trees.read_text(tree, path)
+        )
+    except InvalidInput as error:
+        path = claim_files.path_of(change.key)
+        return [
+            each.within(path) if claim_files.kind_of(each.file) is None else each
+            for each in error.faults
+        ]
+    return []
+
+
+def _without(state: State, changes: Iterable[ClaimChange]) -> State:
+    ledger, undone = state.ledger, list[ClaimChange]()
+    for change in changes:
+        ledger = ledger.replace(change.key, change.before)
+        undone.append(ClaimChange(change.after, change.before))
+    return state.with_ledger(ledger, undone) if undone else state
+
+
+def render_all(tree: Tree, state: State, more: Files = MappingProxyType({})) -> Changeset:
+    """Return the generated files that differ from those of ``tree``, and the files ``more``."""
+    generated = trees.texts(tree, GENERATED_ROOTS)
+    files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))
+    changes = []
+    are_files = {path: trees.is_file(child) for path, child in trees.entries(tree, GENERATED_ROOTS)}
+    for path, is_file in are_files.items():
+        if path not in files and not (is_file and trees.is_readme(path)):
+            files[path] = None
+    for path in sorted(files):
+        old = generated.get(path)
+        # a link is replaced by a file, even if its text is the right one
+        if old == files[path] and are_files.get(path, True):
+            del files[path]
+            continue
+        kind: Change = "stop" if files[path] is None else "start" if old is None else "change"
+        name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
+        changes.append(ReleaseChange(name, path, path, kind))
+    return Changeset({**more, **files}, tuple(changes))
+
+
+# ---- what people are told of a configuration that is not in effect ----
+
+# How many faults get the commit that caused them, and how many commits are named to be reverted.
+_MOST_ORIGINS, _MOST_REVERTED = 100, 20
+
+
+class Problem(NamedTuple):
+    """A fault, with the id and the author of the commit that caused it, or empty texts."""
+
+    file: str
+    field: str
+    message: str
+    since: str
+    author: str
+    line: int | None
+
+    def __str__(self) -> str:
+        text = str(Fault("invalid", self.field, self.message, self.file, self.line))
+        return f"{text} (since {self.since[:10]} by {self.author})" if self.since else text
+
+
+def problems_of(repo: Repository, snapshot: Snapshot) -> tuple[Problem, ...]:
+    if not snapshot.problems:
+        return ()
+    tree = trees.commit_of(repo, snapshot.commit).tree
+    origin = commit_log.fault_origin(repo, snapshot.configuration, snapshot.commit)
+    problems = []
+    faults = dict.fromkeys(with_lines(snapshot.problems, lambda path: trees.read_text(tree, path)))
+    for number, each in enumerate(faults):
+        since, author = origin(each.file) if number < _MOST_ORIGINS else ("", "")
+        problems.append(
+            Problem(each.file, each.field, each.message, since, one_line(author), each.line)
+        )
+    return tuple(problems)
+
+
+def commits_to_revert(repo: Repository, snapshot: Snapshot) -> list[str]:
+    """Return the commits of main, newest first, that changed the files at fault since then."""
+    files = [each.file for each in snapshot.faults if each.file]
+    found = list[str]()
+    for commit in commit_log.first_parents(repo, snapshot.commit):
+        if commit.id == snapshot.configuration or len(found) == _MOST_REVERTED:
+            break
+        if not commit_log.is_by_generator(repo, commit) and trees.differ(
+            trees.parent_tree(commit), commit.tree, files or CONFIG_ROOTS
+        ):
+            found.append(str(commit.id))
+    return found
+
+
+def how_to_mend(repo: Repository, snapshot: Snapshot) -> str:
+    commits = " ".join(commit[:10] for commit in commits_to_revert(repo, snapshot))
+    revert = f", or undo the commits: git revert --no-edit -m 1 {commits}" if commits else ""
+    return f"correct the files{revert}"

@@ -17,7 +17,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, StateRepoError, fault
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.base.settings import API_VERSION, GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT, modeline
+from demandops.base.settings import API_VERSION, GENERATED_ROOTS, MAIN_BRANCH, modeline
 from demandops.decide import changeset
 from demandops.decide.changeset import ABSENT, leaf_differences
 from demandops.decide.planning.release_keys import ReleaseKey
@@ -135,7 +135,7 @@ def _merge_patch(
 
 # ---- the checkout: its files, and the commit that an edit started from ----
 
-_ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
+_ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT, *GENERATED_ROOTS)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
 # A fleet of 20,000 nodes has fewer; more would fill the memory of the machine that checks.
 _MOST_BYTES = 16 << 20

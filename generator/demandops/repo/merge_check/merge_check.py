@@ -17,7 +17,7 @@ from pathlib import Path
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.runtime import REAL
-from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
+from demandops.base.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.base.strict_yaml import with_lines
 from demandops.decide import changeset, warnings
 from demandops.decide.changeset import MergePreview
@@ -181,7 +181,7 @@ def _is_written_by_generator(path: str) -> bool:
     if root == claim_files.LEDGER_ROOT:  # people may edit claims and waiting demands
         is_waiting = path.startswith(f"{records.WAITING_ROOT}/")
         return claim_files.kind_of(path) is None and not is_waiting
-    return root in (*GENERATED_ROOTS, NOTES_ROOT)
+    return root in GENERATED_ROOTS
 
 
 def _suggestions(
@@ -213,8 +213,6 @@ def _remedy(path: str, before: str | None, after: str | None, suggestion: Sugges
         listed = ", ".join(left[:_MOST_LEFT]) + (", …" if len(left) > _MOST_LEFT else "")
         unchanged = f" (this override does not change {listed})" if left else ""
         return f"{lost}, and merge {suggestion.file} as shown{unchanged}"
-    if root == NOTES_ROOT:
-        return "is written by the generator, which would undo the edit; revert the edit"
     if root == claim_files.LEDGER_ROOT:
         if before is not None:
             return "is written only by the generator; revert the edit"
@@ -317,7 +315,8 @@ class _Edit:
             written = {path: change for path, change in by_path.items() if path in self.files}
             for path, change in written.items():
                 if path in self.before:
-                    yield from ledger_files.owner_faults(change.after, path, old.ledger)
+                    was = ledger_files.claim_in(path, old.ledger)
+                    yield from ledger_files.owner_faults(change.after, was, path)
             yield from faults_of_edit(old, state, written.values())
 
     def rendered(self, state: State) -> dict[str, str]:

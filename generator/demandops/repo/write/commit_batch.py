@@ -11,37 +11,27 @@ from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
 from itertools import islice
-from types import MappingProxyType
 
 import pygit2
 from pygit2 import Signature
 
-from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.errors import StateRepoError
 from demandops.base.quoting import one_line
-from demandops.base.settings import GENERATED_ROOTS
 from demandops.decide import edits
 from demandops.decide.booking import Drain
-from demandops.decide.changeset import Change, Changeset, ReleaseChange
 from demandops.decide.decision import Decision, decide
-from demandops.decide.state import State, rendered_files
+from demandops.decide.state import State
 from demandops.model.config.config import NODES_FILE
 from demandops.model.config.override import Override
-from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import ClaimKey
-from demandops.model.ledger.ledger import claim_changes
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
-from demandops.repo.load import last_valid_config, ledger_files
 from demandops.repo.load import snapshot as snapshots
-from demandops.repo.load.snapshot import Advance, Snapshot
+from demandops.repo.load.snapshot import Followed, Snapshot
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02
-# The effect of people's changes: the snapshot, the changed files, and the keys of the claims that
-# overrides may have changed.
-_Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
 
 
 class CommitBatch:
@@ -59,6 +49,8 @@ class CommitBatch:
         self.awaited = False
         # the log line about the follow commit, which renders people's changes; empty if none
         self.followed = ""
+        # whether that commit is the first to say that a configuration is not in effect
+        self.tells = False
 
     @property
     def is_empty(self) -> bool:
@@ -75,7 +67,7 @@ class CommitBatch:
         now: datetime,
         more: commit_message.Trailers = (),
     ) -> str:
-        more = [*self._settled, *snapshots.trailers_of(self.head), *more]
+        more = [*self._settled, *self.head.trailers, *more]
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
         self.awaited = self.awaited or decision.awaited
@@ -111,8 +103,16 @@ class CommitBatch:
                 if attempt == _ATTEMPTS:
                     raise
                 self._repository.runtime.sleep(_PAUSE_S * attempt)
-        valid = self.head.last_valid_commit if self.head.problems else commit
-        self.head = replace(self.head, commit=commit, state=state, last_valid_commit=valid)
+        held = self.head.faults
+        self.head = replace(
+            self.head,
+            commit=commit,
+            state=state,
+            configuration=self.head.configuration if held else commit,
+            told=self.head.refused if held else None,
+            put_back={},
+            claim_faults=(),
+        )
         return str(commit)
 
     def record_in_next_commit(self, operation: str, outcome: commit_log.Settled) -> None:
@@ -120,86 +120,49 @@ class CommitBatch:
         # the demand again, because later demands could change the outcome.
         self._settled.append((commit_log.settled_trailer(outcome), operation))
 
-    def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
-        """Render people's changes, and commit the generated files that differ, if any.
+    def follow(self, followed: Followed, now: datetime) -> None:
+        """Carry out people's commits: commit what a generator must write because of them, if any.
 
-        What cannot be planned or rendered stays in effect as it was, as a problem of ``head``.
+        The commit also says which configuration is in effect, if that has changed.
         """
-        self.head, change, keys = self._followed(advance, before, now)
-        state, tip, problems = self.head.state, self.head.commit, self.head.problems
-        files, reported = dict(change.files), self.read(last_valid_config.PATH)
-        origin = commit_log.fault_origin(self._objects, before.last_valid_commit, self.start.commit)
-        report = last_valid_config.write(
-            last_valid_config.with_origins(problems, last_valid_config.read(reported), origin)
-        )
-        if report != reported:
-            files[last_valid_config.PATH] = report
-        if not files:
+        self.head, before, change = followed.snapshot, followed.before, followed.change
+        if not followed.must_commit:
             return
-        overrides = [
-            *edits.changed_override_files(before.state, state),
-            *change.overrides,
-        ]
-        of_overrides = commit_message.override_trailers(overrides, keys)
-        causes = commit_log.person_commits_since(self._objects, before.last_valid_commit, tip)
+        overrides = edits.changed_override_files(before.state, self.head.state)
+        of_overrides = commit_message.override_trailers(
+            [*overrides, *change.overrides], followed.keys
+        )
+        # also of those whose commits were not in effect until now
+        causes = commit_log.person_commits_since(
+            self._objects, before.configuration, self.start.commit
+        )
+        held = self.head.faults
+        self.tells = bool(held) and self.head.told != self.head.refused
         text = commit_message.of_follow(
             change.releases,
-            str(tip),
+            str(self.start.commit),
             str(before.commit),
-            problems,
+            str(self.head.configuration) if held else "",
+            snapshots.problems_of(self._objects, self.head) if self.head.problems else (),
+            snapshots.how_to_mend(self._objects, self.head) if held else "",
             [
                 *of_overrides,
-                *commit_message.demand_trailers(keys),
+                *commit_message.demand_trailers(followed.keys),
                 *commit_log.caused_by_trailers(causes),
-                *snapshots.trailers_of(self.head),
+                *self.head.trailers,
             ],
-            reports=report != reported,
         )
         author = commit_log.follow_author(causes, now)
-        self.commit_files(files, state, text, author, now)
+        self.commit_files(change.files, self.head.state, text, author, now)
         title = text.partition("\n")[0]
         self.followed = one_line(", ".join([title, *(path for _, path in of_overrides)]))
-
-    def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
-        judgement = snapshots.judge(self._objects, advance, before, self._tree)
-        accepted, change = judgement.with_new_config(), None
-        if advance.config_changed:
-            try:
-                marked = last_valid_config.end_markers_at(self._tree)
-                state, subjects = accepted.snapshot.state, accepted.subjects
-                applied = edits.update_ledger(before.state, state, subjects, marked, now)
-                state = replace(state, ledger=applied.ledger)
-                change = self.render_all(state, applied.files)
-            except InvalidInput as error:
-                accepted = judgement.with_old_config(error.faults)
-        if change is None:
-            # with the configuration as before, only the subjects that people changed are rendered
-            state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
-            applied = edits.update_claims(old, state, subjects, now)
-            touched = claim_changes(state.ledger, applied.ledger, applied.keys)
-            state = state.with_ledger(applied.ledger, touched)
-            subjects = tuple(dict.fromkeys((*subjects, *(edit.key.subject for edit in touched))))
-            change = edits.changeset_of_edit(state, old, subjects, self.read)
-            change = replace(change, files={**applied.files, **change.files})
-        # an approved claim's lease starts only now, because else it could end before the approval
-        snapshot, ledger, files = accepted.snapshot, state.ledger, dict(change.files)
-        for claim in ledger.unstarted_claims():
-            assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
-            path = claim_files.path_of(claim.key)
-            earlier = ledger_files.lease_before_approval(self._objects, snapshot.commit, path)
-            started = replace(claim, lease=claim.lease.started(now, earlier))
-            ledger = ledger.replace(claim.key, started)
-            files[path] = claim_files.text_of(started)
-        # a lease does not affect a release, so the usage of nodes need not be counted again
-        snapshot = replace(snapshot, state=state.with_ledger(ledger, ()))
-        return snapshot, replace(change, files=files), tuple(applied.keys)
 
     def end_override(self, override: Override, now: datetime) -> None:
         # InvalidInput is raised if the state without the override cannot be planned or rendered
         applied = edits.end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
-        change = self.render_all(state, applied.files)
-        more = snapshots.trailers_of(self.head)
+        change = snapshots.render_all(self._tree, state, applied.files)
+        more = self.head.trailers
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
 
@@ -214,34 +177,11 @@ class CommitBatch:
             by_people = (change.entry for change in changes if not change.entry.by_generator)
             causes = [trees.commit_of(self._objects, e.commit) for e in islice(by_people, 1)]
             caused_by = commit_log.caused_by_trailers(causes)
-            more = [*caused_by, *snapshots.trailers_of(self.head)]
+            more = [*caused_by, *self.head.trailers]
             text = commit_message.of_decision(decision, operation, now, more)
             author = commit_log.follow_author(causes, now)
             self.commit_files(decision.files, decision.state, text, author, now)
         return decision
-
-    def render_all(
-        self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
-    ) -> Changeset:
-        generated = trees.texts(self._tree, GENERATED_ROOTS)
-        files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))
-        changes = []
-        are_files = {
-            path: trees.is_file(child) for path, child in trees.entries(self._tree, GENERATED_ROOTS)
-        }
-        for path, is_file in are_files.items():
-            if path not in files and not (is_file and trees.is_readme(path)):
-                files[path] = None
-        for path in sorted(files):
-            old = generated.get(path)
-            # a link is replaced by a file, even if its text is the right one
-            if old == files[path] and are_files.get(path, True):
-                del files[path]
-                continue
-            kind: Change = "stop" if files[path] is None else "start" if old is None else "change"
-            name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
-            changes.append(ReleaseChange(name, path, path, kind))
-        return Changeset({**more, **files}, tuple(changes))
 
     def publish(self) -> bool:
         if self.is_empty:

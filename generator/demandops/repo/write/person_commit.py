@@ -12,16 +12,17 @@ from datetime import datetime
 from pygit2 import Blob, Commit, Oid, Tree
 from pygit2.enums import FileMode
 
-from demandops.base.errors import Fault, InvalidInput, StateRepoError
+from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
+from demandops.model.config.config import CONFIG_ROOTS
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import MAIN, StateRepository
 from demandops.repo.history import commit_message
 from demandops.repo.history.commit_log import Person
 from demandops.repo.history.commit_message import compose
-from demandops.repo.load import last_valid_config
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.write.proposal_branch import PendingProposal, ProposalBranches
 
 _ATTEMPTS = 5
@@ -149,17 +150,23 @@ def _commit(
     details: CommitDetails,
 ) -> Oid:
     tree = repository.new.add_tree(tip.tree, files)
-    # faults that main has already do not stop a person, who may be mending them one by one
-    new_faults = _config_faults(repository.objects[tree].peel(Tree)) - _config_faults(tip.tree)
-    if new_faults:
-        raise InvalidInput(sorted(new_faults, key=str))
+    if any(path.split("/", 1)[0] in CONFIG_ROOTS for path in files):
+        # what a person adds to a configuration that is not valid would not be in effect either
+        _require_valid(repository, tip)
+        snapshots.config_at(repository.objects[tree].peel(Tree))
     who = commit_message.signature(*details.person, details.now)
     return repository.new.add_commit(repository.signer, (who, who), details.text, tree, parents)
 
 
-def _config_faults(tree: Tree) -> set[Fault]:
+def _require_valid(repository: StateRepository, tip: Commit) -> None:
     try:
-        last_valid_config.config_at(tree)
-    except InvalidInput as error:
-        return {*error.faults}
-    return set()
+        held = snapshots.state_at(repository.objects, tip.id)
+    except InvalidInput:
+        return  # there is no generator yet, or no state in effect: the new files alone are judged
+    if held.faults:
+        problem = snapshots.problems_of(repository.objects, held)[0]
+        raise StateRepoError(
+            f"nothing of {MAIN_BRANCH}'s configuration is in effect, because it is not valid, so "
+            f"nothing was changed; first {snapshots.how_to_mend(repository.objects, held)}: "
+            f"{problem}"
+        )

@@ -30,6 +30,7 @@ from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.history.commit_log import RecordedOutcome
 from demandops.repo.load import ledger_files
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.journal import ProposalRecord
@@ -56,6 +57,8 @@ from demandops.serve.approvals.proposal import (
 from demandops.serve.demands import TAKEN_BACK, Demands, Receipt, Ticket
 
 log = logging.getLogger("demandops")
+
+_MOST_TOLD = 20  # faults in the comment on a pull request
 
 # How many seconds a check of all proposals may take before it pauses for a queued demand.
 _LONGEST_CHECK_S = 0.5
@@ -399,6 +402,22 @@ class Approvals:
             del heads.branches[branch]
 
     # ---- the end ----
+
+    def tell_of_faults(self, snapshot: Snapshot) -> None:
+        """Comment on the pull requests whose merge made the configuration of main invalid."""
+        forge, objects = snapshot.state.config.repo_settings.proposals, self._repository.objects
+        if forge.forge not in ("github", "gitea"):
+            return
+        held = f"the configuration of commit {str(snapshot.configuration)[:10]} stays in effect"
+        problems = snapshots.problems_of(objects, snapshot)[:_MOST_TOLD]
+        text = (
+            f"This is not in effect, because main is not valid; {held}, as a whole, until a commit "
+            "is valid.\n\n"
+            + "".join(f"- {code(str(problem))}\n" for problem in problems)
+            + f"\nTo mend this, {snapshots.how_to_mend(objects, snapshot)}.\n"
+        )
+        for commit in snapshots.commits_to_revert(objects, snapshot):
+            self._forge.comment(forge, commit, text)
 
     def _forget(self, proposal: Proposal, closed_as: str) -> None:
         self.proposals.pop(proposal.branch, None)

@@ -28,10 +28,11 @@ _REST_S = 60.0  # how long to pause after a forge has answered that it got too m
 @dataclass(frozen=True, slots=True)
 class _Task:
     forge: Proposals
-    branch: str
+    branch: str  # of a proposal, or the commit whose pull request gets a comment
     title: str
     body: str
     closed_as: str = ""  # why to close the pull request; empty to open it
+    is_comment: bool = False
 
 
 class ForgeWorker:
@@ -59,6 +60,9 @@ class ForgeWorker:
             with self._lock:
                 self._wanted[branch] = task
             self._enqueue(task)
+
+    def comment(self, forge: Proposals, commit: str, text: str) -> None:
+        self._enqueue(_Task(forge, commit, "", text, is_comment=True))
 
     def was_queried(self, branch: str) -> bool:
         # also true if the forge cannot be queried now
@@ -99,6 +103,9 @@ class ForgeWorker:
                 try:
                     if (forge := forge_for(task.forge, self._token_file)) is None:
                         continue
+                    if task.is_comment:
+                        forge.comment(task.branch, task.body)
+                        continue
                     pull_request = self._handle(task, forge, pull_request)
                 except ForgeError as error:
                     if str(error) != self._last_error:
@@ -128,7 +135,9 @@ class ForgeWorker:
 
     def _remember(self, task: _Task, pull_request: PullRequest | None) -> None:
         with self._lock:
-            if task.closed_as or task.branch not in self._wanted:  # forgotten during the query
+            if (
+                task.is_comment or task.closed_as or task.branch not in self._wanted
+            ):  # forgotten during the query
                 return
             before = self._pull_requests.get(task.branch, "not queried")
             self._pull_requests[task.branch] = pull_request
