@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from graphlib import CycleError, TopologicalSorter
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, StringConstraints, model_validator
 
 from demandops.base import strict_yaml
-from demandops.base.errors import sentences, suggestion
+from demandops.base.errors import InvalidInput, sentences, suggestion
 from demandops.model.config import base_model, inventory
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId, PropertyName, Resources
@@ -137,9 +138,30 @@ def ignored_fields(path: str, text: str) -> list[str]:
     return [field for field in strict_yaml.lines(text) if _IGNORED.fullmatch(field)]
 
 
+# The forms in which such a field may stand, and what stays in its place
+_FORMS = (
+    (re.compile(r",\s*downAfter:[^,}#\n]+"), ""),
+    (re.compile(r"downAfter:[^,}#\n]+,\s*"), ""),
+    (re.compile(r"^ *downAfter:.*\n?", re.MULTILINE), ""),
+    (re.compile(r"downAfter:[^,}#\n]+(?=})"), ""),
+    (re.compile(r"downAfter:[^#\n]*?(?= *(?:#|$))", re.MULTILINE), "{}"),
+)
+
+
 def without_ignored_fields(path: str, text: str) -> str:
+    """Return a definition's text without these fields; one in an odd form stays."""
     for field in ignored_fields(path, text):
-        text = strict_yaml.without_field(text, field)
+        with suppress(InvalidInput):  # it has several documents
+            wanted = scaling = strict_yaml.load(text)
+            for key in field.split(".")[:-1]:
+                scaling = scaling[key]
+            del scaling["downAfter"]
+            for form, left in _FORMS:
+                for match in form.finditer(text):
+                    shorter = text[: match.start()] + left + text[match.end() :]
+                    with suppress(InvalidInput):
+                        if strict_yaml.load(shorter) == wanted:
+                            return without_ignored_fields(path, shorter)
     return text
 
 

@@ -6,7 +6,6 @@ between two of them, and ``decide.planning.overrides`` applies overrides to rele
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -72,14 +71,6 @@ def _one_line(text: str) -> str:
     if not text.isprintable():
         raise ValueError(f"{quoted(text)} is more than one line of plain text; write one line")
     return text
-
-
-def _finite(value: Any) -> None:  # noqa: ANN401 - Helm values are any data
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"contains {value}, which is not a number in JSON; choose another value")
-    inner = value.values() if isinstance(value, dict) else value
-    for item in inner if isinstance(value, dict | list) else ():
-        _finite(item)
 
 
 def _not_empty(items: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -149,9 +140,7 @@ class OverrideFile(FileModel):
     priority: Annotated[int, Field(ge=-1_000_000, le=1_000_000)] = 0
     expires: Annotated[str, base_model.readable_by(parse_time)] | None = None
     select: Annotated[Items[Selector], AfterValidator(_not_empty)]
-    values: (
-        Annotated[dict[str, Any], Field(min_length=1), base_model.readable_by(_finite)] | None
-    ) = None
+    values: Annotated[dict[str, Any], Field(min_length=1)] | None = None
     version: Annotated[str, StringConstraints(min_length=1, max_length=63), Visible] | None = None
     images: Annotated[dict[DnsLabel, ImagePin], Field(min_length=1)] | None = None
     replicas: Annotated[int, Field(ge=0, le=1000)] | None = None
