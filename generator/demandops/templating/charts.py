@@ -129,17 +129,17 @@ def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
             exports = _values(dependency.folder, files).get("exports")
             for name in dependency.imports:
                 values = exports.get(name) if isinstance(exports, dict) else None
-                more = merged({}, values if isinstance(values, dict) else {})
-                imported = merged(more, imported)  # as in Helm, the first import of a value counts
-    return merged(imported, _values(folder, files))
+                # as in Helm, the first import of a value counts
+                imported = merged(values if isinstance(values, dict) else {}, imported)
+    return _without_nulls(merged(imported, _values(folder, files)))
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    # by Helm's rules, so null removes a key
+    # by Helm's rules: null removes what is below it, and stays where nothing is
     result = dict(below)
     for key, value in above.items():
-        if value is None:
-            result.pop(key, None)
+        if value is None and key in result:
+            del result[key]
         elif isinstance(value, dict) and isinstance(result.get(key), dict):
             result[key] = merged(result[key], value)
         else:
@@ -147,16 +147,33 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
     return result
 
 
-def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
-    """Return ``target`` with a JSON merge patch (RFC 7386) applied; null removes a key."""
-    if not isinstance(patch, Mapping):
-        return patch
-    result = dict(target) if isinstance(target, Mapping) else {}
+def _without_nulls(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        key: _without_nulls(value) if isinstance(value, dict) else value
+        for key, value in values.items()
+        if value is not None
+    }
+
+
+def overridden(values: Any, patch: Mapping[str, Any], below: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Return Helm values with an override's merge patch (RFC 7386); null removes a key.
+
+    Over a default of the chart in ``below``, null stays, because only so Helm removes the default.
+    So it does if ``below`` is None: what the chart has is not known.
+    """
+    result = dict(values) if isinstance(values, Mapping) else {}
     for key, value in patch.items():
-        if value is None:
-            result.pop(key, None)
+        default = below.get(key, {}) if isinstance(below, Mapping) else below
+        if isinstance(value, Mapping):
+            inner = result.get(key)
+            if key in result and inner is None and isinstance(default, Mapping):
+                # another override removed all defaults, and this one brings none of them back
+                inner = dict.fromkeys(default)
+            result[key] = overridden(inner, value, default)
+        elif value is not None or below is None or (isinstance(below, Mapping) and key in below):
+            result[key] = value
         else:
-            result[key] = merge_patch(result.get(key), value)
+            result.pop(key, None)
     return result
 
 

@@ -29,7 +29,7 @@ from demandops.model.config.base_model import (
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.model.config.policy import matches
 from demandops.model.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
-from demandops.templating.charts import merge_patch
+from demandops.templating.charts import overridden
 
 OVERRIDES_ROOT = "overrides"
 
@@ -262,7 +262,10 @@ Settings = TypeVar("Settings", bound=ClientSettings)
 
 
 def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
-    data = merge_patch(settings.model_dump(by_alias=True), patch)
+    data = overridden(settings.model_dump(by_alias=True), patch, {})
+    if isinstance(resources := data.setdefault("resources", {}), dict):
+        for name in ("requests", "limits"):  # null removes what a client has by default, too
+            resources.setdefault(name, {})
     own, of_mqtt = (
         {field.alias for field in model.model_fields.values()}
         for model in (type(settings), MqttClientSettings)
