@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from demandops.base import strict_yaml
+from demandops.base import addresses, strict_yaml
 from demandops.base.naming import id_problem, message_type_problem, topic_problem
 from demandops.base.quoting import quoted
 from demandops.model.config import base_model
@@ -167,14 +167,12 @@ def _number(value: str | float) -> float | None:
 # A node belongs to one cluster. It runs services only in access domains: in the one whose patterns
 # match it, and in those that it lists. A node selector identifies the node in its cluster.
 
-Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
+Host = Annotated[str, base_model.readable_by(addresses.host)]
 
 # A key in a Kubernetes Secret; in the pod, the key is a file's name
 SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
 
-_ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
-# A Zenoh endpoint whose protocol needs no certificates, like `tcp/host:7447`
-Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$"), base_model.Visible]
+Endpoint = Annotated[str, base_model.readable_by(addresses.endpoint)]
 
 
 class Tls(CamelModel):
@@ -196,8 +194,9 @@ class Zenoh(CamelModel):
     """The Zenoh bridge that a node runs when a connection needs it.
 
     Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
-    the endpoint's port at every IPv4 address. It always connects to the routers in ``connect``. If
-    none of these fields is given, the bridge only connects to bridges that have an endpoint.
+    the endpoint's port at every IPv4 address, or every IPv6 address if the endpoint is one. It
+    always connects to the routers in ``connect``. If none of these fields is given, the bridge only
+    connects to bridges that have an endpoint.
     """
 
     endpoint: Endpoint | None = None
@@ -216,8 +215,9 @@ class Zenoh(CamelModel):
     def listening(self) -> tuple[str, ...]:
         if self.listen or not self.endpoint:
             return self.listen
-        protocol, _, address = self.endpoint.partition("/")
-        return (f"{protocol}/0.0.0.0:{address.rpartition(':')[2]}",)
+        endpoint = addresses.endpoint(self.endpoint)
+        everywhere = "[::]" if ":" in endpoint.host else "0.0.0.0"  # noqa: S104
+        return (f"{endpoint.protocol}/{everywhere}:{endpoint.port}",)
 
 
 class Wan(CamelModel):

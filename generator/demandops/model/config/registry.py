@@ -5,7 +5,6 @@ A chart is in a folder of the state repo, an OCI registry or an HTTP chart repos
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,9 +12,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
+from demandops.base import addresses
 from demandops.base.errors import sentences, suggestion
 from demandops.model.config import base_model
-from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel, Visible
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel
 from demandops.model.config.inventory import Rmw
 
 ChartVersion = Annotated[
@@ -24,7 +24,7 @@ ChartVersion = Annotated[
 
 ChartFolder = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
 
-Repository = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")]
+Repository = Annotated[str, base_model.readable_by(addresses.repository)]
 Tag = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")]
 Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
 
@@ -34,8 +34,8 @@ class ChartSource(FrozenModel):
 
     version: ChartVersion
     folder: ChartFolder | None = None
-    oci: Annotated[str, StringConstraints(pattern=r"^oci://[^\s]+$"), Visible] | None = None
-    http: Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$"), Visible] | None = None
+    oci: Annotated[str, base_model.readable_by(addresses.oci_chart)] | None = None
+    http: Annotated[str, base_model.readable_by(addresses.http_chart)] | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> ChartSource:
@@ -44,11 +44,6 @@ class ChartSource(FrozenModel):
             raise ValueError(
                 "needs exactly one of folder, oci and http"
                 + (f", not {' and '.join(given)}" if given else "")
-            )
-        if re.search(r"://[^/\s]*@", self.http or self.oci or ""):
-            raise ValueError(
-                "must not contain a user or password; give them to the GitOps controller as a "
-                "Secret"
             )
         if self.folder and ".." in self.folder.split("/"):
             raise ValueError("'folder' must stay inside the state repo; remove '..'")
@@ -103,11 +98,8 @@ class Image(FrozenModel):
         return self
 
     def pulled_from(self, registry: str) -> Image:
-        host, _, path = self.repository.partition("/")
-        # Docker's rule: only such a first part is a host
-        has_host = path and ("." in host or ":" in host or host == "localhost")
-        repository = f"{registry}/{path if has_host else self.repository}"
-        return self.model_copy(update={"repository": repository})
+        path = addresses.repository(self.repository).path
+        return self.model_copy(update={"repository": f"{registry}/{path}"})
 
     def parts(self) -> dict[str, str]:
         return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
@@ -132,7 +124,7 @@ class ImagesFile(FileModel):
     """
 
     kind: Literal["Images"]
-    registry: Repository | None = None
+    registry: Annotated[str, base_model.readable_by(addresses.registry)] | None = None
     images: dict[DnsLabel, Image]
 
 

@@ -2,42 +2,34 @@
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
 from pydantic import StringConstraints, model_validator
 
+from demandops.base.addresses import as_git_url, holds_secret, url, without_secrets
 from demandops.base.quoting import quoted
 from demandops.model.config import base_model
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel, Positive
 
 ROOT_FILE = "demandops.yaml"
 
-_GIT_URL = re.compile(r"(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+")
-_SCP = re.compile(r"(?P<user>[^\s:@/]+)@(?P<host>[^\s:@/]+):(?!\d+/)(?P<path>[^\s/]\S*)")
-
-
-def as_git_url(text: str) -> str:
-    # `git@host:path` is Git's short form of a URL
-    scp = _SCP.fullmatch(text)
-    return f"ssh://{scp['user']}@{scp['host']}/{scp['path']}" if scp else text
-
 
 # The address is in files of the repo and in the clusters, so it must not hold a password. Git's
 # short form `user@host:path` is refused, because the controllers read only URLs.
-def _git_url_problem(text: str) -> str:
-    if _GIT_URL.fullmatch(text):
-        return ""
-    url = as_git_url(text)
-    if url != text:
-        return f"{quoted(text)} is not a URL, but the GitOps controllers need one; write {url}"
-    return (
-        f"{quoted(text)} is not a URL that clusters can fetch; write https://HOST/PATH or "
-        "ssh://USER@HOST/PATH, without a password or token"
-    )
+def _git_url(text: str) -> None:
+    if (long := as_git_url(text)) != text:
+        raise ValueError(
+            f"{quoted(text)} is not a URL, but the GitOps controllers need one; write {long}"
+        )
+    if holds_secret(text) or len(url(text, "https", "ssh", "http").path) < 2:
+        raise ValueError(
+            f"{quoted(without_secrets(text))} is not a URL that clusters can fetch; write "
+            "https://HOST/PATH or ssh://USER@HOST/PATH, without a password or token"
+        )
 
 
-GitUrl = Annotated[str, base_model.without(_git_url_problem), base_model.Visible]
+GitUrl = Annotated[str, base_model.readable_by(_git_url)]
 
 
 class Flux(FrozenModel):
@@ -64,21 +56,17 @@ class ArgoCd(FrozenModel):
 
 
 # A token is sent there, so plain HTTP is only for this machine
-_WEB_URL = re.compile(
-    r"(https://[^\s:@/?#]+|http://(127\.0\.0\.1|localhost|\[::1\]))(:\d+)?(/[^\s?#]*)?"
-)
+def _web_url(text: str) -> None:
+    parts = url(text, "https", "http")
+    is_safe = parts.scheme == "https" or parts.hostname in ("127.0.0.1", "localhost", "::1")
+    if not is_safe or parts.query or parts.fragment or "@" in parts.netloc:
+        raise ValueError(
+            f"{quoted(without_secrets(text))} is not an address that a token may be sent to; write "
+            "https://HOST/PATH, without a user (plain http only for this machine)"
+        )
 
 
-def _web_url_problem(text: str) -> str:
-    if _WEB_URL.fullmatch(text):
-        return ""
-    return (
-        f"{quoted(text)} is not an address that a token may be sent to; write "
-        "https://HOST/PATH, without a user (plain http only for this machine)"
-    )
-
-
-WebUrl = Annotated[str, base_model.without(_web_url_problem), base_model.Visible]
+WebUrl = Annotated[str, base_model.readable_by(_web_url)]
 
 
 class Proposals(FrozenModel):
@@ -114,8 +102,8 @@ class Proposals(FrozenModel):
     @property
     def project(self) -> tuple[str, ...]:
         # owner and name: the last two parts of the path in `url`
-        path = (self.url or "").partition("://")[2].partition("/")[2]
-        return tuple(path.strip("/").removesuffix(".git").split("/")[-2:]) if path else ()
+        path = urlsplit(self.url or "").path.strip("/")
+        return tuple(path.removesuffix(".git").split("/")[-2:]) if path else ()
 
 
 class Limits(CamelModel):
