@@ -13,6 +13,7 @@ import pytest
 import yaml
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
+from demandops.decide.warnings import truth_warnings
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -35,6 +36,20 @@ def test_a_scalar_means_what_it_means_to_helm(form: str, by_helm: str) -> None:
         assert value == wanted and type(value) is type(wanted)
     for written in (strict_yaml.dump({"a": form}), strict_yaml.dump({form: "a"})):
         assert wanted == form or f'"{form}"' in written
+
+
+def test_check_warns_of_words_that_may_be_meant_as_text() -> None:
+    text = "a: NO # way\n# {x, y}\nb: [on, x]\n- y\nc: no one\nd: 'no'\ny: 1\ne: {f: Off}\nyes\ng: nO\n"
+    paths = (
+        "overrides/a.yaml",
+        "appdefs/a/values/a.yaml.j2",
+        "appdefs/a/charts/a/values.yaml",
+        "ledger/a.yaml",
+    )
+    told = [*truth_warnings(dict.fromkeys(paths, text))]
+    assert [one.line for one in told] == [1, 3, 4, 8, 9] * 2
+    assert {one.file for one in told} == {*paths[:2]}
+    assert "NO is false, as" in told[0].message
 
 
 def test_a_key_is_text_or_a_fault() -> None:
