@@ -33,12 +33,7 @@ def _webhook(text: str) -> None:
 
 
 class ClusterAccess(FrozenModel):
-    """The access to a cluster: its API, a webhook of its controller, or both.
-
-    ``receiver`` is the URL of a Flux Receiver, ``webhook`` the URL of Argo CD's webhook.
-    ``secret_file`` holds the secret that signs calls to the receiver or the webhook. ``wake`` says
-    whether the controller is woken after a push.
-    """
+    """The access to a cluster: its API, a webhook of its controller, or both."""
 
     kubeconfig: Path | None = Field(default=None, strict=False)
     context: str | None = None

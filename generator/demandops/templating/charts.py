@@ -8,7 +8,6 @@ file://…`` in ``Chart.yaml`` names. The folder must be in ``appdefs/``.
 from __future__ import annotations
 
 import copy
-import json
 import posixpath
 import re
 from bisect import bisect_left
@@ -270,8 +269,6 @@ def _read(text: str) -> dict[str, Any]:
 # A description starts with ``# --`` above its value and goes on in the comment lines that follow.
 
 _KEY = re.compile(r"( *)([A-Za-z0-9_./-]+):(?: |$)")
-_TYPES = {bool: "bool", int: "int", float: "float", str: "string", list: "list", dict: "object"}
-_HEAD = "| Key | Type | Default | Description |\n|-----|------|---------|-------------|\n"
 
 
 def descriptions(text: str) -> dict[str, str]:
@@ -293,35 +290,6 @@ def descriptions(text: str) -> dict[str, str]:
         else:
             words = []
     return described
-
-
-def table(text: str, root: str = "") -> str:
-    """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``."""
-    values: Any = strict_yaml.load(text)
-    prefix = f"{root}." if root else ""
-    words = {
-        path.removeprefix(prefix): description
-        for path, description in descriptions(text).items()
-        if path.startswith(prefix)
-    }
-    for step in root.split(".") if root else ():
-        values = values[step]
-    rows = sorted(_rows(values, "", words, True), key=lambda row: row[0].lower())
-    return _HEAD + "".join(f"| {' | '.join(row)} |\n" for row in rows)
-
-
-def _rows(
-    values: Mapping[str, Any], prefix: str, words: Mapping[str, str], leaves: bool
-) -> Iterator[tuple[str, str, str, str]]:
-    for name, value in values.items():
-        path = f"{prefix}{name}"
-        nested = isinstance(value, dict) and bool(value)
-        if path in words or (leaves and not nested):
-            default = json.dumps(value, ensure_ascii=False, sort_keys=True, separators=(",", ":"))
-            yield path, _TYPES[type(value)], f"`{default}`", words.get(path, "")
-        if nested:
-            # below a mapping with a description, only values with one of their own are listed
-            yield from _rows(value, f"{path}.", words, leaves and path not in words)
 
 
 # ---- the ``values.schema.json`` of a chart ----

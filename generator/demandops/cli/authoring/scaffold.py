@@ -138,7 +138,6 @@ def application_files(
         ),
     }
     values = _filled(texts["chart-values.yaml"], given)
-    given["VALUES"] = charts.table(values).rstrip("\n")
     schema = charts.composed(
         f"Values of the chart {plan.name}",
         {"launch": _LAUNCH},

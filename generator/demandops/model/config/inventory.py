@@ -193,10 +193,8 @@ class Credentials(CamelModel):
 class Zenoh(CamelModel):
     """The Zenoh bridge that a node runs when a connection needs it.
 
-    Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
-    the endpoint's port at every IPv4 address, or every IPv6 address if the endpoint is one. It
-    always connects to the routers in ``connect``. If none of these fields is given, the bridge only
-    connects to bridges that have an endpoint.
+    By default it listens on the endpoint's port at every IPv4 address, or every IPv6 address if the
+    endpoint is one. Without any field, it only connects to bridges that have an endpoint.
     """
 
     endpoint: Endpoint | None = None
@@ -352,11 +350,7 @@ class Position(CamelModel):
 
 
 class FurtherDomain(CamelModel):
-    """A further access domain of a node, besides the domain whose patterns match the node.
-
-    For connections of this domain, ``zenoh`` and ``wan`` replace those of the node, because two
-    programs cannot listen on one port.
-    """
+    """A further access domain of a node, besides the domain whose patterns match the node."""
 
     name: DnsLabel
     zenoh: Zenoh | None = None
@@ -364,11 +358,7 @@ class FurtherDomain(CamelModel):
 
 
 class Node(CamelModel):
-    """A C-ITS entity that runs services.
-
-    A demand may name the node, or say which ``type``, ``capabilities`` and ``properties`` a node
-    must have (:mod:`.placement`).
-    """
+    """A C-ITS entity that runs services."""
 
     id: NodeId
     # The role of the node; any word
@@ -443,11 +433,7 @@ def id_in_domain(node: str, domain: str) -> str:
 
 
 class Broker(CamelModel):
-    """A message broker and the node that it runs on.
-
-    If ``topic_prefix`` is given, every MQTT topic of a connection at this broker starts with
-    ``topic_prefix`` and ``/``.
-    """
+    """A message broker and the node that it runs on."""
 
     node: NodeId
     type: Literal["mqtt"] = "mqtt"

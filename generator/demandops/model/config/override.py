@@ -96,7 +96,7 @@ class Selector(FrozenModel):
     """Selects the releases and claims that match every field given here.
 
     Patterns may contain ``*`` and ``?``. ``requesters`` matches if a pattern matches one requester
-    of the release or claim. ``labels`` matches if the node's selector has all of these labels.
+    of the release or claim.
     """
 
     applications: Patterns | None = None

@@ -51,10 +51,7 @@ class ChartSource(FrozenModel):
 
 
 class Chart(ChartSource):
-    """A Helm chart: its default version, and further versions by channel.
-
-    A demand may request a channel by name, or one of the versions.
-    """
+    """A Helm chart: its default version, and further versions, which a demand may request."""
 
     channels: dict[base_model.Word, ChartSource] = Field(default_factory=dict)
 
@@ -118,10 +115,7 @@ class ChartsFile(FileModel):
 
 
 class ImagesFile(FileModel):
-    """``registry/images.yaml``, and files of ``registry/images/``.
-
-    If a file gives a ``registry``, all images of the file are pulled from this registry.
-    """
+    """``registry/images.yaml``, and files of ``registry/images/``."""
 
     kind: Literal["Images"]
     registry: Annotated[str, base_model.readable_by(addresses.registry)] | None = None
@@ -129,10 +123,9 @@ class ImagesFile(FileModel):
 
 
 class ImagePin(FrozenModel):
-    """What a version or an override changes of an image in ``registry/images.yaml``.
+    """What a version or an override changes of an image; an absent field changes nothing.
 
-    An absent field changes nothing, except that a new tag removes the image's digest, and a new
-    digest its tag (:meth:`over`).
+    But a new tag removes the image's digest, and a new digest its tag (:meth:`over`).
     """
 
     repository: Repository | None = None
@@ -156,18 +149,17 @@ class ImagePin(FrozenModel):
 
 
 class VersionContents(CamelModel):
-    """The charts and images of one version of an application.
-
-    A chart that is not listed has its default version. An image that is not listed stays as
-    ``registry/images.yaml`` has it.
-    """
+    """The charts and images of a version, where they are not the default ones."""
 
     charts: dict[DnsLabel, ChartVersion] = Field(default_factory=dict)
     images: dict[DnsLabel, ImagePin] = Field(default_factory=dict)
 
 
 class VersionList(CamelModel):
-    """The versions of one application definition, its default version, and its channels."""
+    """The versions of one application definition, its default version, and its channels.
+
+    A definition without this has no versions of its own: those of its charts count.
+    """
 
     default: ChartVersion
     channels: dict[base_model.Word, ChartVersion] = Field(default_factory=dict)
@@ -187,10 +179,7 @@ class VersionList(CamelModel):
 
 
 class VersionsFile(FileModel):
-    """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none.
-
-    A definition without an entry here has no versions of its own: those of its charts count.
-    """
+    """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none."""
 
     kind: Literal["Versions"]
     applications: dict[DnsLabel, VersionList]
@@ -256,11 +245,7 @@ class Resources(FrozenModel):
 
 
 class ClientSettings(CamelModel):
-    """How the client containers of one connection type run.
-
-    Without ``host_network``, a client uses the setting of its node. Each probe has the form of a
-    Kubernetes core/v1 Probe.
-    """
+    """How the client containers of one connection type run; probes are as in Kubernetes."""
 
     env: Annotated[dict[_EnvName, base_model.Text], AfterValidator(_free)] = Field(
         default_factory=dict
@@ -273,11 +258,7 @@ class ClientSettings(CamelModel):
 
 
 class MqttClientSettings(ClientSettings):
-    """The settings of MQTT clients, which are ROS nodes.
-
-    Without ``rmw``, a client uses the middleware of its node. ``messages`` are the packages whose
-    messages the image can carry; an empty list means that these packages are not known.
-    """
+    """The settings of MQTT clients, which are ROS nodes."""
 
     launch_file: _LaunchFile = "standalone.launch.xml"
     rmw: Rmw | None = None

@@ -46,10 +46,7 @@ class Flux(FrozenModel):
 
 
 class ArgoCd(FrozenModel):
-    """How Argo CD fetches this repo, and the namespace that Argo CD runs in.
-
-    Argo CD finds the credentials in a Secret of this namespace. The Secret names the URL.
-    """
+    """How Argo CD fetches this repo, and its namespace, in which a Secret has the credentials."""
 
     url: GitUrl
     namespace: DnsLabel = "argocd"
@@ -73,9 +70,7 @@ class Proposals(FrozenModel):
     """The forge where the generator proposes demands that need approval.
 
     With ``none``, the generator pushes the proposal's branch, but opens no pull request. With
-    GitLab, the push options of the branch open a merge request. With GitHub and Gitea (Forgejo),
-    the generator opens a pull request through the API, whose address follows from ``url`` unless
-    ``api`` gives it.
+    GitLab, the push options of the branch open a merge request. With the others, the API does so.
     """
 
     forge: Literal["none", "gitlab", "github", "gitea"] = "none"
@@ -109,12 +104,8 @@ class Proposals(FrozenModel):
 class Limits(CamelModel):
     """The sizes above which a demand is refused.
 
-    ``demand_characters`` limits the length of the whole demand. ``demand_items`` limits how many
-    things (applications, connections, topics, requesters and so on) the demand lists in total,
-    together with the connections that it needs. ``parameter_bytes`` limits the parameters of an
-    application, written as JSON. ``file_bytes`` limits each file that the generator writes for the
-    demand, because Kubernetes stores no object above 1.5 MB. ``decision_milliseconds`` limits the
-    processor time in which a generator decides the demand, because other demands wait meanwhile.
+    ``demand_items`` counts also the connections that a demand needs. ``file_bytes`` is less than
+    the 1.5 MB that Kubernetes stores. Other demands wait for ``decision_milliseconds``.
     """
 
     demand_characters: Positive = 1_000_000
@@ -127,9 +118,7 @@ class Limits(CamelModel):
 class RepoSettings(FileModel):
     """``demandops.yaml``: the settings of the whole state repo.
 
-    The file may contain both ``flux`` and ``argocd``. Only the section that ``gitops`` names is
-    used. ``placement`` is the rule by which the generator chooses among the nodes that fit an
-    application (:mod:`.placement`).
+    Only the section that ``gitops`` names is used.
     """
 
     kind: Literal["StateRepository"]
