@@ -324,8 +324,8 @@ def revision(data: bytes) -> None:
 def moment(data: bytes) -> None:
     text = _text(data)
     for read, form in (
-        (base_model.parse_timestamp, base_model.time_text),
-        (override.parse_time, override.format_time),
+        (base_model.parse_time, base_model.time_text),
+        (base_model.parse_time, override.format_time),
         (base_model.seconds_of, "{}s".format),
     ):
         with suppress(ValueError):

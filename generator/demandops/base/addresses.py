@@ -30,12 +30,8 @@ def in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
-def _is_host(text: str) -> bool:
-    return is_ip(text) or _HOST_NAME.fullmatch(text) is not None
-
-
 def host(text: str) -> str:
-    if _is_host(text):
+    if is_ip(text) or _HOST_NAME.fullmatch(text):
         return text
     raise ValueError(
         f"{quoted(text)} is not a host; write a name or an IP address alone, without scheme, "
@@ -46,29 +42,20 @@ def host(text: str) -> str:
 def _host_and_port(text: str) -> tuple[str, int] | None:
     # of `host`, `host:80` or `[2001:db8::1]:80`; port 0 if there is none
     match = re.fullmatch(
-        r"(?:\[(?P<v6>[^]]*:[^]]*)\]|(?P<name>[^:\[\]]*))(?P<colon>:(?P<port>[0-9]{0,5}))?", text
+        r"(?:\[(?P<v6>[^]]*:[^]]*)\]|(?P<name>[^:\[\]]*))(?::(?P<port>[0-9]{0,5}))?", text
     )
-    name = match and (match["v6"] or match["name"])
-    if not match or not name or not _is_host(name):
-        return None
-    port = int(match["port"] or 0)
-    return (name, port) if 0 < port < 1 << 16 or not match["colon"] else None
+    with suppress(ValueError):
+        if match and (match["port"] is None or 0 < int(match["port"]) < 1 << 16):
+            return host(match["v6"] or match["name"]), int(match["port"] or 0)
+    return None
 
 
-@dataclass(frozen=True, slots=True)
-class Endpoint:
-    """An endpoint of Zenoh whose protocol needs no certificates, like ``tcp/host:7447``."""
-
-    protocol: str
-    host: str
-    port: int
-
-
-def endpoint(text: str) -> Endpoint:
+def endpoint(text: str) -> tuple[str, str, int]:
+    """Take an endpoint of Zenoh apart, whose protocol needs no certificates."""
     protocol, _, address = text.partition("/")
     name, port = _host_and_port(address) or ("", 0)
     if protocol in ("tcp", "udp", "ws") and port:
-        return Endpoint(protocol, name, port)
+        return protocol, name, port
     raise ValueError(
         f"{quoted(text)} is not an endpoint of Zenoh; write tcp/HOST:PORT (or udp/…, ws/…), such "
         "as tcp/router.example:7447 or tcp/[2001:db8::1]:7447"

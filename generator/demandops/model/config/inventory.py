@@ -213,9 +213,9 @@ class Zenoh(CamelModel):
     def listening(self) -> tuple[str, ...]:
         if self.listen or not self.endpoint:
             return self.listen
-        endpoint = addresses.endpoint(self.endpoint)
-        everywhere = "[::]" if ":" in endpoint.host else "0.0.0.0"  # noqa: S104
-        return (f"{endpoint.protocol}/{everywhere}:{endpoint.port}",)
+        protocol, host, port = addresses.endpoint(self.endpoint)
+        everywhere = "[::]" if ":" in host else "0.0.0.0"  # noqa: S104
+        return (f"{protocol}/{everywhere}:{port}",)
 
 
 class Wan(CamelModel):

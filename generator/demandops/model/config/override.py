@@ -25,6 +25,7 @@ from demandops.model.config.base_model import (
     Items,
     Pattern,
     Visible,
+    parse_time,
 )
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.model.config.policy import matches
@@ -33,31 +34,10 @@ from demandops.templating.charts import overridden
 
 OVERRIDES_ROOT = "overrides"
 
-_MOMENT = re.compile(
-    r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,6})\d*)?([Zz]|[+-]\d\d:\d\d)"
-)
 _SHAPING = ("values", "version", "images", "replicas", "node")
 _OF_SERVICES = ("version", "replicas", "node")
 # The effects of overrides, in the order in which messages list them
 EFFECTS = (*_SHAPING, "hold", "deny", "keep")
-
-
-def parse_time(text: str) -> datetime:
-    """Parse an RFC 3339 time that has a time zone, and return it in UTC."""
-    match = _MOMENT.fullmatch(text)
-    if match is None:
-        raise ValueError(
-            f"{quoted(text)} is not a time with a time zone; write one like 2026-01-31T12:00:00Z"
-        )
-    day, clock, fraction, zone = match.groups()
-    zone = "+00:00" if zone in "Zz" else zone
-    try:
-        moment = datetime.fromisoformat(f"{day}T{clock}.{(fraction or '0').ljust(6, '0')}{zone}")
-        return moment.astimezone(timezone.utc)
-    except (ValueError, OverflowError):
-        raise ValueError(
-            f"{quoted(text)} is a time that does not exist; correct the date or the clock time"
-        ) from None
 
 
 def format_time(moment: datetime) -> str:
