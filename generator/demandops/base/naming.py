@@ -174,7 +174,7 @@ PATTERN_WORDS = {
     r"^[a-z][a-z0-9_]*$": f"{_LOWER} and '_', with a letter first, for example sensor_msgs",
     r"^[a-z][A-Za-z0-9_]*$": f"{_ANY} and '_', with a small letter first, for example memoryGiB",
     r"^[a-z0-9./-]+$": f"{_LOWER}, '.', '/' and '-', such as cpu or nvidia.com/gpu",
-    r"^\d+(\.\d+)?(m|k|Ki|M|Mi|G|Gi)?$": "a quantity, such as 500m, 2 or 1Gi",
+    r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi)?$": "a quantity, such as 500m, 2 or 1Gi",
     r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$": "the name of a resource, such as cpu or nvidia.com/gpu",
     r"^[A-Za-z_][A-Za-z0-9_]*$": f"{_ANY} and '_', with no digit first, for example ROS_DOMAIN_ID",
     r"^[A-Za-z0-9_.-]+$": f"{_ANY}, '_', '.' and '-', such as start.launch.py",
@@ -188,10 +188,10 @@ PATTERN_WORDS = {
     r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$": (
         f"one or more parts with '/' between them (fleet/one), each of {_ANY}, '_' and '-'"
     ),
-    r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
+    r"^[0-9]+\.[0-9]+\.[0-9]+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
     r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder in appdefs/, such as appdefs/mine/charts/one",
     r"^sha256:[0-9a-f]{64}$": "a digest, which is 'sha256:' and 64 digits (0 to 9, a to f)",
-    r"^(\d+h)?(\d+m)?(\d+s)?$": "a duration, such as 30s, 1m or 1h30m",
+    r"^([0-9]+h)?([0-9]+m)?([0-9]+s)?$": "a duration, such as 30s, 1m or 1h30m",
     r"^[^\s,][^\n\r,]*$": "a label on one line, with no comma, and no white space at its start",
     r"^([a-z0-9.-]+/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?$": (
         "the key of a label, such as node_id or example.org/host"

@@ -235,7 +235,7 @@ class Wan(CamelModel):
         return self
 
 
-_QUANTITY = re.compile(r"(\d{1,15})(?:\.(\d{1,3}))?(m|k|M|G|T|Ki|Mi|Gi|Ti)?")
+_QUANTITY = re.compile(r"([0-9]{1,15})(?:\.([0-9]{1,3}))?(m|k|M|G|T|Ki|Mi|Gi|Ti)?")
 _FACTORS = {"m": 1, "": 1000} | {
     unit: 1000 * base**power
     for base, units in ((1000, ("k", "M", "G", "T")), (1024, ("Ki", "Mi", "Gi", "Ti")))

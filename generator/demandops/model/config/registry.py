@@ -19,7 +19,7 @@ from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, F
 from demandops.model.config.inventory import Rmw
 
 ChartVersion = Annotated[
-    str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
+    str, StringConstraints(pattern=r"^[0-9]+\.[0-9]+\.[0-9]+(-[0-9A-Za-z.-]+)?$", max_length=40)
 ]
 
 ChartFolder = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
@@ -219,7 +219,7 @@ class ApplicationVersion:
 
 
 _EnvName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-_Quantity = Annotated[str, StringConstraints(pattern=r"^\d+(\.\d+)?(m|k|Ki|M|Mi|G|Gi)?$")]
+_Quantity = Annotated[str, StringConstraints(pattern=r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi)?$")]
 _Resource = Annotated[str, StringConstraints(pattern=r"^[a-z0-9./-]+$")]
 _LaunchFile = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]+$")]
 _Package = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*$")]

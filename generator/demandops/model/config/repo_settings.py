@@ -40,7 +40,7 @@ class Flux(FrozenModel):
 
     url: GitUrl | None = None
     interval: Annotated[
-        str, StringConstraints(pattern=r"^(\d+h)?(\d+m)?(\d+s)?$", min_length=2)
+        str, StringConstraints(pattern=r"^([0-9]+h)?([0-9]+m)?([0-9]+s)?$", min_length=2)
     ] = "1m"
     secret: DnsLabel | None = None
 
