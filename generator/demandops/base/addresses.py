@@ -65,10 +65,10 @@ def endpoint(text: str) -> tuple[str, str, int]:
 # ---- URLs ----
 
 # The host of a URL with its port, up to where its path or the text around it begins
-_PLAIN_HOST = r"(?:\[[0-9A-Fa-f:.]+\]|[^/@\s:\[\]?#'\"]+)(?::[0-9]*)?(?=[/?#\s'\",;)>]|$)"
+_PLAIN_HOST = r"(?:\[[^][@/\s]+\]|[^/@\s:\[\]?#'\"]+)(?::[0-9]*)?(?=[/?#\s'\",;)>]|$)"
 # Matches the user and password of a URL in a text. If what follows `://` is no host, a password may
 # hold any character, even a slash.
-_USER = re.compile(rf"(?<=://)(?:[^/\s]*@(?={_PLAIN_HOST})|(?!{_PLAIN_HOST})\S*@)")
+_USER = re.compile(rf"(?<=://)(?!/)(?:[^/\s]*@(?={_PLAIN_HOST})|(?!{_PLAIN_HOST})\S*@)")
 # A user name that is a token. Other user names are allowed, because some forges need one.
 _TOKEN = re.compile(
     r"gh[a-z]_|github_pat_|gl[a-z]+-|ATBB|ATCTT|(?=[a-z]*\d)[a-z0-9]{32,}@$", re.IGNORECASE
