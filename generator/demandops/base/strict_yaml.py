@@ -54,7 +54,7 @@ _WORDS: Mapping[str, bool | None] = dict.fromkeys(("", "~", "null", "Null", "NUL
     for form in (word, word.title(), word.upper())
 }
 _WITH_BASE = re.compile(r"[-+]?0([xX][0-9a-fA-F]+|[bB][01]+|[oO]?[0-7]+)")
-_DECIMAL = re.compile(r"[-+]?([0-9]+)?(?:\.[0-9_]*)?(?:[eE][-+]?[0-9]+)?")
+_DECIMAL = re.compile(r"[-+]?[0-9]*(?:\.[0-9_]*)?(?:[eE][-+]?[0-9]+)?")
 _NOT_IN_JSON = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
 
 
@@ -76,14 +76,11 @@ def plain_value(text: str) -> str | float | bool | None:
             return number
         if not is_old:
             return text
-    match = _DECIMAL.fullmatch(digits)
-    try:
-        value = float(digits) if match else math.inf
-    except ValueError:  # such as `-` and `.5_`
-        return text
-    if not math.isfinite(value):  # as Go, which has no number that is too large for 64 bits
-        return text
-    return int(digits) if match and match[1] and digits.lstrip("+-") == match[1] else value
+    with suppress(ValueError):  # of `-` and `.5_`
+        # what is too large for 64 bits is text to Go
+        if _DECIMAL.fullmatch(digits) and math.isfinite(value := float(digits)):
+            return int(digits) if digits.lstrip("+-").isdigit() else value
+    return text
 
 
 # ---- reading ----
@@ -119,7 +116,8 @@ class Loader(_CLoader):  # type: ignore[misc]
                 yield self._value(self.get_event(), 1)
 
     def get_single_data(self) -> Any:  # noqa: ANN401 - for yaml.load
-        return next(self.documents(1), None)
+        documents = [*self.documents(1)]
+        return documents[0] if documents else None
 
     def _value(self, event: Any, depth: int) -> Any:  # noqa: ANN401
         kind = type(event)
@@ -129,7 +127,8 @@ class Loader(_CLoader):  # type: ignore[misc]
             message = "anchors and aliases (& and *) are not allowed; write the value out"
             raise InvalidInput.at(where, message)
         if event.tag not in _TAGS[kind]:
-            if event.tag == _LIST and (found := next(self._lists, None)) and depth <= MAX_DEPTH:
+            is_list = event.tag == _LIST and getattr(event, "value", None) == ""
+            if is_list and depth <= MAX_DEPTH and (found := next(self._lists, None)):
                 return found
             shown = short_repr(event.tag)
             raise _problem(f"the tag {shown} is not allowed; write plain data", event)
@@ -171,10 +170,7 @@ class Loader(_CLoader):  # type: ignore[misc]
 def short_repr(value: object) -> str:
     if value is None or isinstance(value, bool):
         return json.dumps(value)
-    try:
-        text = repr(value)
-    except ValueError:  # Python does not print numbers of more than 4300 digits
-        return "a number with thousands of digits"
+    text = repr(value)
     return text if len(text) <= 60 else text[:57] + "…"
 
 
@@ -243,7 +239,8 @@ def _only_document(text: str) -> Any:  # noqa: ANN401
             value = Loader(rest, left).get_single_data() if lists else None
             if value is not None and next(left, None) is None:
                 return value
-    return next(iter([*load_all(text, most=1)]), None)
+    documents = [*load_all(text, most=1)]
+    return documents[0] if documents else None
 
 
 # ---- writing ----
