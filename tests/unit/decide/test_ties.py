@@ -14,11 +14,7 @@ import pytest
 from demandops.decide.changeset import trial_releases
 from demandops.decide.planning.overrides import Traits, apply_effects, effects_on, fits
 from demandops.model.config.override import Override, OverrideFile, Selector
-from demandops.model.config.override_conflicts import (
-    contested_effects,
-    patches_commute,
-    patterns_overlap,
-)
+from demandops.model.config.override_conflicts import patterns_overlap
 from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease
 from demandops.templating.charts import merged, overridden
@@ -27,7 +23,7 @@ from hypothesis import strategies as st
 
 from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import may_select_same_release
+from tests.kit.config import contested_effects, may_select_same_release, patches_commute
 from tests.kit.memory import MemoryRepo
 
 TEXTS = ["".join(chars) for size in range(7) for chars in product("ab", repeat=size)]
