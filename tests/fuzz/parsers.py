@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache, wraps
-from itertools import islice, product
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from demandops.detect import rule_file
 from demandops.detect.detector import Detector, Want
 from demandops.detect.observations import MessageReader, Observation, Unreadable
 from demandops.model.config import base_model, override
+from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.load import load
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
@@ -198,9 +199,7 @@ def _is_json(value: Any) -> bool:
 
 
 def without_field(data: bytes) -> None:
-    text = _text(data)
-    for field in islice(strict_yaml.lines(text), 20):
-        strict_yaml.without_field(text, field)
+    without_ignored_fields("appdefs/a/service.yaml", _text(data))
 
 
 def set_key(data: bytes) -> None:
@@ -325,8 +324,8 @@ def revision(data: bytes) -> None:
 def moment(data: bytes) -> None:
     text = _text(data)
     for read, form in (
-        (base_model.parse_timestamp, base_model.time_text),
-        (override.parse_time, override.format_time),
+        (base_model.parse_time, base_model.time_text),
+        (base_model.parse_time, override.format_time),
         (base_model.seconds_of, "{}s".format),
     ):
         with suppress(ValueError):

@@ -15,7 +15,7 @@ import yaml
 from demandops.base.runtime import REAL
 from demandops.cli.main import run
 from demandops.cli.queries.get import KINDS
-from demandops.model.config.override import parse_time
+from demandops.model.config.base_model import parse_time
 from demandops.repo.git.repository import RemoteAway
 from demandops.repo.reader import Reader
 

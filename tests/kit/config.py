@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from itertools import product
@@ -12,7 +13,7 @@ import yaml
 from demandops.decide.state import State
 from demandops.model.config import override_conflicts
 from demandops.model.config.config import CONFIG_ROOTS, Config
-from demandops.model.config.override import Selector
+from demandops.model.config.override import Override, Selector
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.new_repo import files
 from demandops.templating.values import evaluate
@@ -71,3 +72,37 @@ def may_select_same_release(
         override_conflicts.may_match_same_release(*pair, config, shares)
         for pair in product(one, other)
     )
+
+
+SINGLE = ("version", "replicas", "node")
+FROZEN = (*SINGLE, "values", "images")
+
+
+def contested_effects(first: Override, second: Override) -> list[str]:
+    """Return what two overrides of a priority set differently, pair by pair, as an oracle."""
+    contested = [
+        name
+        for name in SINGLE
+        if None not in (left := getattr(first, name), right := getattr(second, name))
+        and left != right
+    ]
+    if first.values and second.values and not patches_commute(first.values, second.values):
+        contested.append("values")
+    pins = (first.images or {}, second.images or {})
+    contested += [
+        f"images.{name}"
+        for name in sorted({*pins[0]} & {*pins[1]})
+        if pins[0][name] != pins[1][name]
+    ]
+    for holding, shaping in ((first, second), (second, first)):
+        effects = [name for name in shaping.effects() if name in FROZEN]
+        if holding.hold and effects:
+            contested += ["hold", *effects]
+    return contested
+
+
+def patches_commute(first: object, second: object) -> bool:
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return all(patches_commute(first[key], second[key]) for key in first if key in second)
+    # unlike ==, JSON distinguishes 1 from True
+    return json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)

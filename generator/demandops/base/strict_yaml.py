@@ -1,8 +1,10 @@
 """Strict reading and deterministic writing of YAML.
 
 The program reads a YAML file with :func:`load` or, if the file may have several documents, with
-:func:`load_all`. Duplicate keys, anchors and tags are errors. :func:`dump` writes strings so that
-YAML 1.1 and 1.2, PyYAML and Go's parsers read the same value.
+:func:`load_all`. A scalar without quotes means what it means to Helm and kubectl, which read with
+go-yaml 2: numbers as YAML 1.2 has them, and ``yes``, ``on`` or ``0644`` as YAML 1.1. Duplicate
+keys, anchors and tags are errors. :func:`dump` writes text so that all parsers, of YAML 1.1 and 1.2
+and Go's mixtures of both, read the same text.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 import yaml
@@ -26,32 +27,12 @@ import yaml
 from demandops.base.errors import Fault, InvalidInput
 
 # libyaml, which not every build of PyYAML has, reads and writes several times as fast
-LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-
-# Finds texts that every parser reads as text without quotes, except for a few words
-_PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*(?:[:@=][A-Za-z0-9_./-]+)*")
-_WORDS = frozenset(
-    ["y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "none"]
-)  # some parsers do not read these words as text
+_CLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_CDumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 # How many characters a file may have; an inventory of 20,000 nodes has fewer
 MAX_LENGTH = 4_000_000
 MAX_DEPTH = 100
-# How many bits a whole number may have. Python prints at most 4,300 digits.
-_MAX_BITS = 14_000
-# what PyYAML raises, beside its own errors, for texts that do not fit a tag, such as `!!int x`
-_MISFITS = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
-
-# Finds the digits before the `e` of a JSON number like `1e-09`. YAML 1.1 would read such a number
-# as text. The pattern matches quoted texts as a whole, so that no digits inside them are found.
-_EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
-_UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
-
-_TAG = "tag:yaml.org,2002:"
-_TEXT = f"{_TAG}str"
-_RESOLVER, _CONSTRUCTOR = yaml.resolver.Resolver(), yaml.constructor.SafeConstructor()
-_REPRESENTER = yaml.representer.SafeRepresenter()
 
 _Result = TypeVar("_Result")
 _LONGEST_WORD = 1_000
@@ -64,54 +45,79 @@ def _cached(function: Callable[[str], _Result]) -> Callable[[str], _Result]:
     return lambda text: (of_words if len(text) <= _LONGEST_WORD else function)(text)
 
 
-@_cached
-def _tag_of(text: str) -> str:
-    # (True, False): the scalar has no quotes
-    return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
+# ---- what a scalar without quotes means: the rules of go-yaml 2 (resolve.go) ----
 
-
-def _integer(node: yaml.ScalarNode) -> int:
-    number: int = _CONSTRUCTOR.construct_yaml_int(node)
-    if number.bit_length() > _MAX_BITS:
-        raise _problem(f"a whole number has more than {_MAX_BITS} bits; shorten it", node)
-    return number
-
-
-# The function that makes the value of a date, number, truth value or null, by YAML tag
-_CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
-    f"{_TAG}timestamp": _CONSTRUCTOR.construct_scalar,  # dates stay text
-    f"{_TAG}int": _integer,
-    f"{_TAG}float": _CONSTRUCTOR.construct_yaml_float,
-    f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
-    f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
+_WORDS: Mapping[str, bool | None] = dict.fromkeys(("", "~", "null", "Null", "NULL")) | {
+    form: value
+    for value, words in ((True, "true yes on y"), (False, "false no off n"))
+    for word in words.split()
+    for form in (word, word.title(), word.upper())
 }
+_WITH_BASE = re.compile(r"[-+]?0([xX][0-9a-fA-F]+|[bB][01]+|[oO]?[0-7]+)")
+_DECIMAL = re.compile(r"[-+]?[0-9]*(?:\.[0-9_]*)?(?:[eE][-+]?[0-9]+)?")
+_NOT_IN_JSON = re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+
+
+@_cached
+def plain_value(text: str) -> str | float | bool | None:
+    """Return what a scalar without quotes means, such as 420 for ``0o644``."""
+    if text in _WORDS:
+        return _WORDS[text]
+    if text[0] not in "+-.0123456789":
+        return text  # dates, times and `12:30` too are text
+    if _NOT_IN_JSON.fullmatch(text):
+        raise ValueError(f"{text} is no number to Helm or JSON; write a number, or use quotes")
+    # `1_000` is a number, but before a point Go wants a digit on both sides of each `_`
+    digits = text if text.startswith(".") else text.replace("_", "")
+    if _WITH_BASE.fullmatch(digits):
+        is_old = digits.lstrip("+-")[1:].isdigit()  # 0644 is octal in YAML 1.1
+        number = int(digits, 8 if is_old else 0)
+        if -(2**63) <= number < 2**64:
+            return number
+        if not is_old:
+            return text
+    with suppress(ValueError):  # of `-` and `.5_`
+        # what is too large for 64 bits is text to Go
+        if _DECIMAL.fullmatch(digits) and math.isfinite(value := float(digits)):
+            return int(digits) if digits.lstrip("+-").isdigit() else value
+    return text
+
+
+# ---- reading ----
+
+_TAG = "tag:yaml.org,2002:"
+# the tag `!` says that the scalar is text
+_TAGS = {
+    yaml.ScalarEvent: (None, "!", f"{_TAG}str"),
+    yaml.SequenceStartEvent: (None, "!", f"{_TAG}seq"),
+    yaml.MappingStartEvent: (None, "!", f"{_TAG}map"),
+}
+# Takes the place of a list of texts in the text that PyYAML reads (`_only_document`)
+_LIST = "!demandops-list"
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
     return yaml.constructor.ConstructorError(None, None, what, at.start_mark)
 
 
-class _Misread(Exception):
-    # stand-ins (_STAND_IN) cannot replace the lists of a text
-    pass
+class Loader(_CLoader):  # type: ignore[misc]
+    """Builds the values of a text in one pass over libyaml's events."""
 
+    def __init__(self, text: str, lists: Iterable[list[str]] = ()) -> None:
+        super().__init__(text)
+        self._lists = iter(lists)
 
-class _Parser:
-    """Builds the values of a text in one pass over PyYAML's events."""
-
-    # `lists` maps each placeholder (`_STAND_IN`) in the text to the list that it replaces
-    def __init__(self, text: str, lists: Mapping[str, list[str]] = MappingProxyType({})) -> None:
-        self._next, self._lists = LOADER(text).get_event, dict(lists)
-
-    def documents(self, most: float) -> Iterator[Any]:
-        while not isinstance(event := self._next(), yaml.StreamEndEvent):
+    def documents(self, most: float = math.inf) -> Iterator[Any]:
+        while not isinstance(event := self.get_event(), yaml.StreamEndEvent):
             if isinstance(event, yaml.DocumentStartEvent):
                 most -= 1
                 if most < 0:
                     raise _problem("another document starts here; only one is allowed", event)
-                yield self._value(self._next(), 1)
-        if self._lists:
-            raise _Misread
+                yield self._value(self.get_event(), 1)
+
+    def get_single_data(self) -> Any:  # noqa: ANN401 - for yaml.load
+        documents = [*self.documents(1)]
+        return documents[0] if documents else None
 
     def _value(self, event: Any, depth: int) -> Any:  # noqa: ANN401
         kind = type(event)
@@ -120,98 +126,51 @@ class _Parser:
             where = f"line {event.start_mark.line + 1}"
             message = "anchors and aliases (& and *) are not allowed; write the value out"
             raise InvalidInput.at(where, message)
-        if kind is yaml.ScalarEvent and event.value in self._lists:
-            if event.tag or not event.implicit[0] or depth > MAX_DEPTH:
-                raise _Misread
-            return self._lists.pop(event.value)
+        if event.tag not in _TAGS[kind]:
+            is_list = event.tag == _LIST and getattr(event, "value", None) == ""
+            if is_list and depth <= MAX_DEPTH and (found := next(self._lists, None)):
+                return found
+            shown = short_repr(event.tag)
+            raise _problem(f"the tag {shown} is not allowed; write plain data", event)
         if kind is yaml.ScalarEvent:
-            return self._scalar(event)
+            if event.tag or not event.implicit[0]:
+                return event.value
+            try:
+                return plain_value(event.value)
+            except ValueError as error:
+                raise _problem(str(error), event) from None
         # recursive code that later reads the values could exceed Python's limit
         if depth > MAX_DEPTH:
             raise InvalidInput.at("", f"is nested deeper than {MAX_DEPTH} levels; make it flatter")
-        name = "seq" if kind is yaml.SequenceStartEvent else "map"
-        if event.tag not in (None, "!", f"{_TAG}{name}"):
-            raise _refused_tag(event.tag, event)
-        if name == "seq":
+        if kind is yaml.SequenceStartEvent:
             items = []
-            while type(event := self._next()) is not yaml.SequenceEndEvent:
+            while type(event := self.get_event()) is not yaml.SequenceEndEvent:
                 items.append(self._value(event, depth + 1))
             return items
         mapping: dict[str, Any] = {}
-        while type(event := self._next()) is not yaml.MappingEndEvent:
-            key = self._value(event, depth + 1)
-            if not isinstance(key, str):  # YAML 1.1 reads the key `on` as true
-                raise _problem(f"the key {short_repr(key)} must be text; put it in quotes", event)
+        while type(event := self.get_event()) is not yaml.MappingEndEvent:
+            key = self._key(event, depth + 1)
             if key in mapping:  # parsers differ in which of the two counts
                 raise _problem(f"the key {key!r} appears twice; remove one", event)
-            mapping[key] = self._value(self._next(), depth + 1)
+            mapping[key] = self._value(self.get_event(), depth + 1)
         return mapping
 
-    def _scalar(self, event: Any) -> Any:  # noqa: ANN401
-        tag = event.tag
-        if tag is None or tag == "!":
-            tag = _tag_of(event.value) if event.implicit[0] else _TEXT
-        if tag == _TEXT:
-            return event.value
-        if tag not in _CONSTRUCT:
-            raise _refused_tag(tag, event)
-        return _CONSTRUCT[tag](yaml.ScalarNode(tag, event.value, event.start_mark))
-
-
-def _refused_tag(tag: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401
-    return _problem(f"the tag {short_repr(tag)} is not allowed; write plain data", at)
-
-
-_START = (yaml.StreamStartEvent(), yaml.DocumentStartEvent(explicit=False))
-_END = (yaml.DocumentEndEvent(explicit=False), yaml.StreamEndEvent())
-_MAPPING = yaml.MappingStartEvent(None, None, True, flow_style=False), yaml.MappingEndEvent()
-_SEQUENCE = yaml.SequenceStartEvent(None, None, True, flow_style=False), yaml.SequenceEndEvent()
-
-
-def _events(value: Any) -> Iterator[yaml.Event]:  # noqa: ANN401
-    # PyYAML's own dumper would write an anchor for a part that occurs twice, and `load` takes none
-    if isinstance(value, str):
-        yield _text(value)
-    elif isinstance(value, list | tuple):
-        yield _SEQUENCE[0]
-        for item in value:
-            yield from (_text(item),) if isinstance(item, str) else _events(item)
-        yield _SEQUENCE[1]
-    elif isinstance(value, Mapping):
-        yield _MAPPING[0]
-        for key, item in value.items():
-            yield _text(key)
-            yield from _events(item)
-        yield _MAPPING[1]
-    else:
-        number = str(_REPRESENTER.represent_data(value).value)
-        yield yaml.ScalarEvent(None, None, (True, False), number)
-
-
-@_cached
-def _text(text: str) -> yaml.ScalarEvent:
-    """Return PyYAML's event that writes a text, in quotes if a parser could misread it."""
-    if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
-        return yaml.ScalarEvent(None, None, (True, False), text)
-    # a literal block has no escapes, and with another begin or end it would need an indicator
-    is_block = (
-        text.endswith("\n")
-        and not text.endswith("\n\n")
-        and not text.startswith((" ", "\n"))
-        and text.count("\n") > 1
-        and not re.search(r"[ \t]\n|[^\x20-\x7e\n]", text)
-    )
-    style = "|" if is_block else '"'
-    return yaml.ScalarEvent(None, None, (False, True), text, style=style)
+    def _key(self, event: Any, depth: int) -> str:  # noqa: ANN401
+        key = self._value(event, depth)
+        if isinstance(key, bool) and event.value in "yYnN":
+            key = event.value  # a coordinate, rather than yes or no
+        if not isinstance(key, str):  # Helm reads the key `on` as true
+            shown = getattr(event, "value", "") or short_repr(key)
+            raise _problem(f"the key {shown} must be text; put it in quotes", event)
+        if key == "<<" and event.implicit[0]:
+            raise _problem("'<<' is not allowed; write the fields out", event)
+        return key
 
 
 def short_repr(value: object) -> str:
     if value is None or isinstance(value, bool):
         return json.dumps(value)
-    try:
-        text = repr(value)
-    except ValueError:  # Python does not print numbers of more than 4300 digits
-        return "a number with thousands of digits"
+    text = repr(value)
     return text if len(text) <= 60 else text[:57] + "…"
 
 
@@ -224,8 +183,8 @@ def _strict(file: str) -> Iterator[None]:
         where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
         message = f"not valid YAML: {problem or str(error).splitlines()[0]}"
         raise InvalidInput.at(where, message, file=file) from error
-    except _MISFITS as error:
-        message = "not valid YAML: it has a tag, number or character that cannot be read"
+    except ValueError as error:  # of libyaml, for `"\Uffffffff"`
+        message = "not valid YAML: it has a character that cannot be read"
         raise InvalidInput.at("", message, file=file) from error
     except InvalidInput as error:
         raise InvalidInput(faults_in(error, file)) from None
@@ -237,18 +196,14 @@ def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]
         message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
         raise InvalidInput.at("", message, file=file)
     with _strict(file):
-        yield from _Parser(text).documents(most)
+        yield from Loader(text).documents(most)
 
 
-# Matches a field with a list of plain texts, as `to_json` writes it
+# Matches a field with a list of plain texts, as `to_json` writes it. The json module reads a list
+# of at least so many characters, 20 times as fast as PyYAML.
 _LISTED = re.compile(
-    r'^( *[A-Za-z][\w-]*: )(\["[ !#-\[\]-~]*"(?:, "[ !#-\[\]-~]*")*\])$', re.MULTILINE
+    r'^( *[A-Za-z][\w-]*: )(\["(?=.{200})[ !#-\[\]-~]*"(?:, "[ !#-\[\]-~]*")*\])$', re.MULTILINE
 )
-# Lists of at least this many characters are read by the json module. It is 20 times faster than
-# PyYAML.
-_LONG = 200
-# The prefix of the stand-ins: words that replace long lists while PyYAML reads the other text
-_STAND_IN = "demandops-list"
 
 # How many characters a text may have for its value to be cached
 _MOST_CACHED = 10_000
@@ -271,74 +226,81 @@ def _document_as_bytes(text: str) -> bytes:
 
 
 def _only_document(text: str) -> Any:  # noqa: ANN401
-    lists: dict[str, list[str]] = {}
+    lists: list[list[str]] = []
 
-    def stand_in(match: re.Match[str]) -> str:
-        if len(match[2]) < _LONG:
-            return match[0]
-        name = f"{_STAND_IN}-{len(lists)}"
-        lists[name] = json.loads(match[2])
-        return match[1] + name
+    def taken_out(match: re.Match[str]) -> str:
+        lists.append(json.loads(match[2]))
+        return match[1] + _LIST
 
-    if _LONG <= len(text) <= MAX_LENGTH and _STAND_IN not in text:
-        short = _LISTED.sub(stand_in, text)
-        if lists:
-            # if this fails, the text is read unchanged, so that the fault names the right line
-            with suppress(_Misread, yaml.YAMLError, InvalidInput, *_MISFITS):
-                if documents := list(_Parser(short, lists).documents(1)):
-                    return documents[0]
-    documents = list(load_all(text, most=1))
+    if len(text) <= MAX_LENGTH and _LIST not in text:
+        rest, left = _LISTED.sub(taken_out, text), iter(lists)
+        # if a list is inside a text, say, the text is read as it is, so that a fault has its line
+        with suppress(yaml.YAMLError, InvalidInput, ValueError):
+            value = Loader(rest, left).get_single_data() if lists else None
+            if value is not None and next(left, None) is None:
+                return value
+    documents = [*load_all(text, most=1)]
     return documents[0] if documents else None
 
 
+# ---- writing ----
+
+# Finds texts that every parser reads as text without quotes, except for a few words
+_PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*(?:[:@=][A-Za-z0-9_./-]+)*")
+_NOT_TEXT = {word.lower() for word in _WORDS} | {"nan", "inf", "infinity", "none"}
+
+_START = yaml.DocumentStartEvent(explicit=False)
+_END = yaml.DocumentEndEvent(explicit=False)
+_MAPPING = yaml.MappingStartEvent(None, None, True, flow_style=False), yaml.MappingEndEvent()
+_SEQUENCE = yaml.SequenceStartEvent(None, None, True, flow_style=False), yaml.SequenceEndEvent()
+
+
+class Dumper(_CDumper):  # type: ignore[misc]
+    """Writes values in the order in which they are, and text in quotes if it needs them."""
+
+    def represent(self, data: object) -> None:
+        self.emit(_START)
+        self._write(data)
+        self.emit(_END)
+
+    def _write(self, value: Any) -> None:  # noqa: ANN401
+        # PyYAML's own would write an anchor for a part that occurs twice, and `load` takes none
+        if isinstance(value, str):
+            self.emit(_text(value))
+        elif isinstance(value, list | tuple):
+            self.emit(_SEQUENCE[0])
+            for item in value:
+                self._write(item)
+            self.emit(_SEQUENCE[1])
+        elif isinstance(value, Mapping):
+            self.emit(_MAPPING[0])
+            for key, item in value.items():
+                self.emit(_text(key))
+                self._write(item)
+            self.emit(_MAPPING[1])
+        else:
+            self.emit(yaml.ScalarEvent(None, None, (True, False), to_json(value)))
+
+
 def dump(data: Mapping[str, Any]) -> str:
-    try:
-        return _block(data, "").lstrip("\n ") + "\n"
-    except _NotSimple:
-        events = (*_START, *_events(data), *_END)
-        return str(yaml.emit(events, Dumper=_Dumper, allow_unicode=True, width=4096))
-
-
-class _NotSimple(Exception):
-    # only PyYAML writes such a text: with escapes, of several lines, or long
-    pass
-
-
-# Matches a text that fits in double quotes on one line, without escapes
-_SIMPLE = re.compile(r"[ !#-\[\]-~]{0,1000}")
-_LONGEST_KEY = 100  # PyYAML writes longer ones (128) on a line of their own, after `?`
-
-
-def _block(value: Any, indent: str) -> str:  # noqa: ANN401
-    # PyYAML writes the same text, but takes ten times as long. The first line follows `key:` or
-    # `-`, and further lines begin with `indent`.
-    if isinstance(value, str):
-        return f" {_simple_text(value)}"
-    inner = f"{indent}  "
-    if isinstance(value, list | tuple):
-        # the first line of an item's block is beside its dash
-        items = [_block(item, inner).replace(f"\n{inner}", " ", 1) for item in value]
-        return "".join([f"\n{indent}-{item}" for item in items]) or " []"
-    if isinstance(value, Mapping):
-        fields = []
-        for key, item in value.items():
-            if len(key) > _LONGEST_KEY:
-                raise _NotSimple
-            # a list below a key is not indented further, as PyYAML has it
-            block = _block(item, indent if isinstance(item, list | tuple) else inner)
-            fields.append(f"\n{indent}{_simple_text(key)}:{block}")
-        return "".join(fields) or " {}"
-    return f" {_REPRESENTER.represent_data(value).value}"
+    return str(yaml.dump(data, Dumper=Dumper, allow_unicode=True, width=4096))
 
 
 @_cached
-def _simple_text(text: str) -> str:
-    style = _text(text).style
-    if not style:
-        return text
-    if style == "|" or not _SIMPLE.fullmatch(text):
-        raise _NotSimple
-    return f'"{text}"'
+def _text(text: str) -> yaml.ScalarEvent:
+    """Return PyYAML's event that writes a text, in quotes if a parser could misread it."""
+    if _PLAIN.fullmatch(text) and text.lower() not in _NOT_TEXT:
+        return yaml.ScalarEvent(None, None, (True, False), text)
+    # a literal block has no escapes, and with another begin or end it would need an indicator
+    is_block = (
+        text.endswith("\n")
+        and not text.endswith("\n\n")
+        and not text.startswith((" ", "\n"))
+        and text.count("\n") > 1
+        and not re.search(r"[ \t]\n|[^\x20-\x7e\n]", text)
+    )
+    style = "|" if is_block else '"'
+    return yaml.ScalarEvent(None, None, (False, True), text, style=style)
 
 
 def set_key(text: str, key: str, value: object) -> str:
@@ -346,58 +308,24 @@ def set_key(text: str, key: str, value: object) -> str:
 
     A form that does not permit this, such as a list, is a fault.
     """
-    with _strict(""):
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-    pairs = node.value if isinstance(node, yaml.MappingNode) else []
-    current = next((value for name, value in pairs if name.value == key), None)
-    if isinstance(current, yaml.ScalarNode):
-        start, end = current.start_mark.index, current.end_mark.index
-        changed = text[:start] + dump({key: value}).partition(": ")[2].rstrip("\n") + text[end:]
-    else:
-        newline = "" if text.endswith("\n") else "\n"
-        added = f"{newline}\n{dump({key: value})}"
+    before, written = load(text), dump({key: value})
+    line = re.compile(rf"^{re.escape(key)}:.*?(?=[ \t]*(?:#.*)?\r?$)", re.MULTILINE)
+    changed, count = line.subn(lambda _: written.rstrip("\n"), text, count=1)
+    if not count:
+        added = f"{'' if text.endswith(chr(10)) else chr(10)}\n{written}"
         # a file from Windows keeps its line ends
         changed = text + (added.replace("\n", "\r\n") if "\r\n" in text else added)
-    try:  # the text may have other forms than those above, such as flow style
-        succeeded = load(changed) == {**load(text), key: value}
-    except (InvalidInput, TypeError):
-        succeeded = False
-    if not succeeded:
-        message = f"cannot be set automatically; set it to {short_repr(value)} by hand"
-        raise InvalidInput.at(key, message)
-    return changed
+    with suppress(InvalidInput, TypeError):  # the text may have another form, such as flow style
+        if load(changed) == {**before, key: value}:
+            return changed
+    message = f"cannot be set automatically; set it to {short_repr(value)} by hand"
+    raise InvalidInput.at(key, message)
 
 
-def without_field(text: str, field: str) -> str:
-    """Return a file's text without a field, such as ``a.b``; the rest stays, including comments.
-
-    If its form does not permit this, the text is returned unchanged.
-    """
-    *parents, last = field.split(".")
-    try:
-        wanted = inner = load(text)
-        node: Any = yaml.compose(text, Loader=yaml.SafeLoader)
-        for parent in parents:
-            inner = inner[parent]
-            node = next(value for name, value in node.value if name.value == parent)
-        del inner[last]
-        key, value = next(pair for pair in node.value if pair[0].value == last)
-    except (InvalidInput, LookupError, StopIteration, TypeError, ValueError):
-        return text  # it has several documents, or a key that is no text, like `1`
-    head, tail = text[: key.start_mark.index], text[value.end_mark.index :]
-    if len(node.value) == 1:
-        head += "" if node.flow_style else "{}"
-    elif node.flow_style:
-        before_comma = re.sub(r",\s*\Z", "", head)
-        if before_comma == head:  # the field is the first, or a comment precedes it
-            tail = re.sub(r"\A\s*,\s*", "", tail)
-        head = before_comma
-    else:
-        head, tail = head[: head.rfind("\n") + 1], tail.partition("\n")[2]
-    try:
-        return head + tail if load(head + tail) == wanted else text
-    except InvalidInput:
-        return text
+# Finds the digits before the `e` of a JSON number like `1e-09`. YAML 1.1 would read such a number
+# as text. The pattern matches quoted texts as a whole, so that no digits inside them are found.
+_EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
+_UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
 def to_json(value: object) -> str:
@@ -450,7 +378,7 @@ def lines(text: str, document: int = 0) -> dict[str, int]:
     with suppress(InvalidInput, yaml.YAMLError):
         for _ in load_all(text):  # refuses what nests too deeply for `add`
             pass
-        nodes = yaml.compose_all(text, Loader=LOADER)
+        nodes = yaml.compose_all(text, Loader=_CLoader)
         add(next(islice(nodes, document, None), None), "")
     return by_field
 

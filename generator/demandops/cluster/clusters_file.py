@@ -8,31 +8,37 @@ only wake the controller. The secret that signs webhook calls is in a separate f
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from demandops.base import addresses
 from demandops.base.errors import InvalidInput, fault
 from demandops.base.strict_yaml import located_in, read_input, read_secret, with_lines
-from demandops.model.config.base_model import DnsLabel, FileModel, FrozenModel, parse_file
+from demandops.model.config.base_model import (
+    DnsLabel,
+    FileModel,
+    FrozenModel,
+    parse_file,
+    readable_by,
+)
 
 
 class NoAccess(ValueError):
     """Raised, without a secret in the text, if a controller has no address or kubeconfig."""
 
 
-class ClusterAccess(FrozenModel):
-    """The access to a cluster: its API, a webhook of its controller, or both.
+def _webhook(text: str) -> None:
+    addresses.url(text, "https", "http")
 
-    ``receiver`` is the URL of a Flux Receiver, ``webhook`` the URL of Argo CD's webhook.
-    ``secret_file`` holds the secret that signs calls to the receiver or the webhook. ``wake`` says
-    whether the controller is woken after a push.
-    """
+
+class ClusterAccess(FrozenModel):
+    """The access to a cluster: its API, a webhook of its controller, or both."""
 
     kubeconfig: Path | None = Field(default=None, strict=False)
     context: str | None = None
-    receiver: str | None = Field(default=None, pattern=r"^https?://\S+$")
-    webhook: str | None = Field(default=None, pattern=r"^https?://\S+$")
+    receiver: Annotated[str, readable_by(_webhook)] | None = None
+    webhook: Annotated[str, readable_by(_webhook)] | None = None
     secret_file: Path | None = Field(default=None, strict=False)
     wake: bool = True
 

@@ -6,15 +6,15 @@ import hashlib
 import hmac
 import json
 import logging
-import re
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf
 from typing import Any
-from urllib.parse import quote, urlsplit
+from urllib.parse import urlsplit
 
 from demandops.base import http_call
+from demandops.base.addresses import in_url
 from demandops.base.errors import InvalidInput
 from demandops.base.http_call import NoAnswer
 from demandops.base.runtime import REAL, Runtime
@@ -33,7 +33,6 @@ from demandops.render.gitops import domain_folder, domains_in_use, project_of
 # with the source of each Application.
 
 _TIMEOUT_S = 5.0
-_SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")
 
 
 def call_argocd(
@@ -56,12 +55,8 @@ def web_address(repo: str) -> str:
     """Return the address of a repository's web page; NoAccess is raised if it names no host."""
     # Without user and password. Argo CD compares this address with each source's URL by host and
     # path, not by scheme and port.
-    short = None if "://" in repo else _SCP.fullmatch(repo)
-    if short:
-        host, path = short["host"], quote(short["path"])
-    else:
-        parts = urlsplit(repo)
-        host, path = parts.hostname or "", parts.path.removeprefix("/")
+    parts = urlsplit(repo)
+    host, path = in_url(parts.hostname or ""), parts.path.removeprefix("/")
     if not host:
         raise NoAccess(
             "the state repo's URL names no host, but Argo CD needs a host to recognize the repo; "

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from demandops.base import naming
+from demandops.base.addresses import in_url
 from demandops.base.errors import Fault, Refused, fault
 from demandops.base.quoting import quoted
 from demandops.connections import connection as routes
@@ -135,7 +136,7 @@ class MqttEnd(End):
         yield (
             config.file_of(configs.BROKERS_FILE, broker.node),
             broker.node,
-            f"broker at {broker.host}:{broker.port}",
+            f"broker at {in_url(broker.host)}:{broker.port}",
         )
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:
@@ -166,7 +167,8 @@ class MqttEnd(End):
                     "ros_topic": route.written_topic,
                     **_options(route),
                 }
-        broker: dict[str, Any] = {"host": self.broker.host, "port": self.broker.port}
+        # the client puts both into a URL as they are
+        broker: dict[str, Any] = {"host": in_url(self.broker.host), "port": self.broker.port}
         if self.broker.tls:
             broker["tls"] = {"enabled": True}
             if self.broker.tls.ca_secret:

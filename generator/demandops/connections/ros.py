@@ -6,13 +6,13 @@ mounted file again at an interval and accepts a new allowlist. Any other change 
 
 from __future__ import annotations
 
-import ipaddress
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 from demandops.base import naming
+from demandops.base.addresses import in_url, is_ip
 from demandops.base.errors import Fault, Refused, fault
 from demandops.connections import connection as routes
 from demandops.connections.connection import ClientKey, Connection, Connections, ConnectionType, End
@@ -119,7 +119,7 @@ class RosEnd(End):
     port: int
 
     def facts(self) -> list[str]:
-        return [*End.facts(self), f"address {self.wan.host}:{self.port}"]
+        return [*End.facts(self), f"address {in_url(self.wan.host)}:{self.port}"]
 
     def configuration(self) -> dict[str, Any]:
         # Each topic passes in one direction only: the router at one end subscribes to it, and the
@@ -149,7 +149,7 @@ class RosEnd(End):
                 reverse.append({**topic, "routes": inward if reads else outward})
         listens = self.node.id == self.listener
         address = {
-            "ip" if _is_ip(self.wan.host) else "domain": self.wan.host,
+            "ip" if is_ip(self.wan.host) else "domain": self.wan.host,
             "port": self.port,
             "transport": self.wan.transport,
         }
@@ -178,10 +178,3 @@ class RosEnd(End):
 def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
     # messages pass only from the sender to the receiver
     return [{"src": sender, "dst": [receiver]}, {"src": receiver}]
-
-
-def _is_ip(host: str) -> bool:
-    try:
-        return bool(ipaddress.ip_address(host))
-    except ValueError:
-        return False

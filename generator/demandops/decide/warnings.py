@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import groupby, islice, takewhile
 
+from demandops.base import strict_yaml
 from demandops.base.errors import MOST_FAULTS, Fault, fault, suggestion
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
@@ -21,7 +22,7 @@ from demandops.decide.planning.flows import flows_without_carrier, topics_of_ori
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.release_keys import claims_needing
 from demandops.model.config.appdef import ignored_fields
-from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
+from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.policy import AccessDomain, matches
 from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
@@ -258,6 +259,24 @@ def ignored_field_warnings(config: Config) -> Iterator[Fault]:
                 "upgrade`, which does so"
             )
             yield fault(ignored, message).within(path)
+
+
+_TRUTH = re.compile(
+    r"(?:^|[:,\[{-])[ ]*\b([yY]|[nN]|[yY]es|YES|[nN]o|NO|[oO]n|ON|[oO]ff|OFF)[ ]*(?=[,\]}]|$)"
+)
+
+
+def truth_warnings(files: Mapping[str, str]) -> Iterator[Fault]:
+    """Warn of words that are no text, although YAML 1.2 and many people take them for text."""
+    for path, text in sorted(files.items()):
+        is_yaml = path.split("/")[0] in CONFIG_ROOTS and path.endswith((".yaml", ".yaml.j2"))
+        if not is_yaml or "/charts/" in path:  # charts are written for Helm
+            continue
+        for number, line in enumerate(text.splitlines(), 1):
+            if match := _TRUTH.search(line.partition("#")[0].rstrip()):
+                value = str(strict_yaml.plain_value(match[1])).lower()
+                message = f"{match[1]} is {value}, as for Helm; write {value}, or use quotes"
+                yield fault("", message, line=number).within(path)
 
 
 # ---- warnings about patterns of the policy that match nothing now ----

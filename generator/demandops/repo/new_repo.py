@@ -11,12 +11,13 @@ from pathlib import Path
 import pygit2
 
 from demandops.base import strict_yaml
+from demandops.base.addresses import as_git_url
 from demandops.base.errors import StateRepoError
 from demandops.base.settings import MAIN_BRANCH, RENDER_VERSION, SCHEMAS_ROOT, data_folder
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.config.load import load
-from demandops.model.config.repo_settings import ROOT_FILE, as_git_url
+from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.signing import Signer

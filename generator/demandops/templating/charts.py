@@ -8,7 +8,6 @@ file://…`` in ``Chart.yaml`` names. The folder must be in ``appdefs/``.
 from __future__ import annotations
 
 import copy
-import json
 import posixpath
 import re
 from bisect import bisect_left
@@ -129,17 +128,17 @@ def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
             exports = _values(dependency.folder, files).get("exports")
             for name in dependency.imports:
                 values = exports.get(name) if isinstance(exports, dict) else None
-                more = merged({}, values if isinstance(values, dict) else {})
-                imported = merged(more, imported)  # as in Helm, the first import of a value counts
-    return merged(imported, _values(folder, files))
+                # as in Helm, the first import of a value counts
+                imported = merged(values if isinstance(values, dict) else {}, imported)
+    return _without_nulls(merged(imported, _values(folder, files)))
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    # by Helm's rules, so null removes a key
+    # by Helm's rules: null removes what is below it, and stays where nothing is
     result = dict(below)
     for key, value in above.items():
-        if value is None:
-            result.pop(key, None)
+        if value is None and key in result:
+            del result[key]
         elif isinstance(value, dict) and isinstance(result.get(key), dict):
             result[key] = merged(result[key], value)
         else:
@@ -147,16 +146,33 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
     return result
 
 
-def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
-    """Return ``target`` with a JSON merge patch (RFC 7386) applied; null removes a key."""
-    if not isinstance(patch, Mapping):
-        return patch
-    result = dict(target) if isinstance(target, Mapping) else {}
+def _without_nulls(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        key: _without_nulls(value) if isinstance(value, dict) else value
+        for key, value in values.items()
+        if value is not None
+    }
+
+
+def overridden(values: Any, patch: Mapping[str, Any], below: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Return Helm values with an override's merge patch (RFC 7386); null removes a key.
+
+    Over a default of the chart in ``below``, null stays, because only so Helm removes the default.
+    So it does if ``below`` is None: what the chart has is not known.
+    """
+    result = dict(values) if isinstance(values, Mapping) else {}
     for key, value in patch.items():
-        if value is None:
-            result.pop(key, None)
+        default = below.get(key, {}) if isinstance(below, Mapping) else below
+        if isinstance(value, Mapping):
+            inner = result.get(key)
+            if key in result and inner is None and isinstance(default, Mapping):
+                # another override removed all defaults, and this one brings none of them back
+                inner = dict.fromkeys(default)
+            result[key] = overridden(inner, value, default)
+        elif value is not None or below is None or (isinstance(below, Mapping) and key in below):
+            result[key] = value
         else:
-            result[key] = merge_patch(result.get(key), value)
+            result.pop(key, None)
     return result
 
 
@@ -253,8 +269,6 @@ def _read(text: str) -> dict[str, Any]:
 # A description starts with ``# --`` above its value and goes on in the comment lines that follow.
 
 _KEY = re.compile(r"( *)([A-Za-z0-9_./-]+):(?: |$)")
-_TYPES = {bool: "bool", int: "int", float: "float", str: "string", list: "list", dict: "object"}
-_HEAD = "| Key | Type | Default | Description |\n|-----|------|---------|-------------|\n"
 
 
 def descriptions(text: str) -> dict[str, str]:
@@ -276,35 +290,6 @@ def descriptions(text: str) -> dict[str, str]:
         else:
             words = []
     return described
-
-
-def table(text: str, root: str = "") -> str:
-    """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``."""
-    values: Any = strict_yaml.load(text)
-    prefix = f"{root}." if root else ""
-    words = {
-        path.removeprefix(prefix): description
-        for path, description in descriptions(text).items()
-        if path.startswith(prefix)
-    }
-    for step in root.split(".") if root else ():
-        values = values[step]
-    rows = sorted(_rows(values, "", words, True), key=lambda row: row[0].lower())
-    return _HEAD + "".join(f"| {' | '.join(row)} |\n" for row in rows)
-
-
-def _rows(
-    values: Mapping[str, Any], prefix: str, words: Mapping[str, str], leaves: bool
-) -> Iterator[tuple[str, str, str, str]]:
-    for name, value in values.items():
-        path = f"{prefix}{name}"
-        nested = isinstance(value, dict) and bool(value)
-        if path in words or (leaves and not nested):
-            default = json.dumps(value, ensure_ascii=False, sort_keys=True, separators=(",", ":"))
-            yield path, _TYPES[type(value)], f"`{default}`", words.get(path, "")
-        if nested:
-            # below a mapping with a description, only values with one of their own are listed
-            yield from _rows(value, f"{path}.", words, leaves and path not in words)
 
 
 # ---- the ``values.schema.json`` of a chart ----

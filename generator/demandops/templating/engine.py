@@ -95,9 +95,7 @@ OPTIONS: dict[str, Any] = {
 @cache
 def _own() -> Environment:
     environment = Environment(  # noqa: S701 - YAML, not HTML
-        loader=FileSystemLoader(data_folder("templates")),
-        bytecode_cache=CompiledTemplates(),
-        **OPTIONS,
+        loader=FileSystemLoader(data_folder("templates")), **OPTIONS
     )
     del environment.filters["tojson"]  # _finalize writes JSON, and would quote that JSON again
     environment.filters |= FILTERS

@@ -6,6 +6,7 @@ import json
 import re
 import traceback
 from collections.abc import Callable, ItemsView, Iterable, Iterator, KeysView, Mapping, ValuesView
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache, wraps
 from typing import Any
@@ -234,8 +235,13 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
     except InvalidInput as error:
         template = files[task.template]
         raise InvalidInput(with_template_lines(error.faults, template, text)) from None
+    below: dict[str, Any] | None = None
+    if task.chart and task.patches:
+        with suppress(InvalidInput):  # YAML that only Helm reads, for example with anchors
+            libraries = (library.alias for library in charts.dependencies(task.chart, files))
+            below = charts.defaults(task.chart, files) | dict.fromkeys(libraries)
     for override, patch in task.patches:
-        values = charts.merge_patch(values, patch)
+        values = charts.overridden(values, patch, below)
         if task.chart:
             _check(values, task.chart, files, override, "the override")
     return values

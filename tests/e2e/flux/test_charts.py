@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from base64 import b64decode
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from demandops.base import strict_yaml
 from demandops.repo.merge_check.helm import HELM_BIN
 
 from tests.e2e.common.expected import NAMESPACE
@@ -19,6 +22,8 @@ from tests.e2e.common.steps import (
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import build_manifest
 from tests.kit.cli import Run
+from tests.unit.render.test_inert import TRAPS, UNSEEN
+from tests.unit.render.test_yaml_as_helm import HELM_READS
 
 ROOT = Path(__file__).resolve().parents[3]
 APPDEFS = (ROOT / "appdefs", ROOT / "examples" / "lane-detection" / "appdefs")
@@ -44,6 +49,20 @@ def charts(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path
     for chart in found.values():
         rig.helm("dependency", "update", "--skip-refresh", str(chart))
     return found
+
+
+def test_helm_reads_scalars_as_recorded_and_texts_as_we_write_them(
+    rig: Rig, tmp_path: Path
+) -> None:
+    forms = {form: json.loads(by_helm) for form, by_helm in HELM_READS.items() if by_helm[0] != "r"}
+    texts = [*TRAPS, *UNSEEN, *HELM_READS]
+    (tmp_path / "templates").mkdir()
+    (tmp_path / "Chart.yaml").write_text("{apiVersion: v2, name: probe, version: 0.1.0}")
+    (tmp_path / "templates" / "read.yaml").write_text("read: {{ .Values | toJson | b64enc }}")
+    values = "".join(f"- {form}\n" for form in forms)
+    (tmp_path / "values.yaml").write_text(f"forms:\n{values}{strict_yaml.dump({'texts': texts})}")
+    read = yaml.safe_load(rig.helm("template", "probe", str(tmp_path)))["read"]
+    assert json.loads(b64decode(read)) == {"forms": [*forms.values()], "texts": texts}
 
 
 @pytest.mark.parametrize(("chart", "values"), CASES)

@@ -105,6 +105,16 @@ def test_no_two_connections_share_an_mqtt_topic_or_a_client_id() -> None:
     assert all(re.fullmatch(r"[a-z0-9-]+(/[A-Za-z0-9_]+)+", topic) for topic in topics)
 
 
+def test_the_host_of_a_broker_becomes_part_of_a_url() -> None:
+    brokers = skeleton()["inventory/brokers.yaml"]
+    brokers = brokers.replace("host: service-mqtt-broker-edge.default.svc", 'host: "2001:db8::1"')
+    repo = MemoryRepo({"inventory/brokers.yaml": brokers})
+    repo.send(goal([], [connection()]))
+    for whole in configurations(repo).values():
+        broker = whole["/**/*"]["ros__parameters"]["broker"]
+        assert broker == {"host": "[2001:db8::1]", "port": 1993}
+
+
 def test_tls_without_a_secret_trusts_what_the_image_trusts() -> None:
     brokers = skeleton()["inventory/brokers.yaml"] + "    tls: {}\n"
     repo = MemoryRepo({"inventory/brokers.yaml": brokers})

@@ -13,20 +13,17 @@ from typing import Any
 import pytest
 from demandops.decide.changeset import trial_releases
 from demandops.decide.planning.overrides import Traits, apply_effects, effects_on, fits
-from demandops.model.config.override import Override, OverrideFile, Selector, merge_patch
-from demandops.model.config.override_conflicts import (
-    contested_effects,
-    patches_commute,
-    patterns_overlap,
-)
+from demandops.model.config.override import Override, OverrideFile, Selector
+from demandops.model.config.override_conflicts import patterns_overlap
 from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease
+from demandops.templating.charts import merged, overridden
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import may_select_same_release
+from tests.kit.config import contested_effects, may_select_same_release, patches_commute
 from tests.kit.memory import MemoryRepo
 
 TEXTS = ["".join(chars) for size in range(7) for chars in product("ab", repeat=size)]
@@ -115,33 +112,69 @@ _text = partial(dumps, sort_keys=True)
 patch = st.fixed_dictionaries({}, optional={"k": json, "l": json})
 
 
-@given(patch, patch, patch)
+# what a chart has below the values: nothing, some defaults, or it is not known
+below = st.none() | patch
+
+
+@given(patch, patch, patch, below)
 @examples(60)
 def test_patches_that_commute_give_the_same_in_either_order(
-    target: dict[str, Any], one: dict[str, Any], other: dict[str, Any]
+    target: dict[str, Any], one: dict[str, Any], other: dict[str, Any], below: dict[str, Any] | None
 ) -> None:
     both = (
-        merge_patch(merge_patch(target, one), other),
-        merge_patch(merge_patch(target, other), one),
+        overridden(overridden(target, one, below), other, below),
+        overridden(overridden(target, other, below), one, below),
     )
     if patches_commute(one, other):
         assert _text(both[0]) == _text(both[1])
 
 
-@given(json, json)
+@given(json, patch)
 def test_a_merge_patch_is_that_of_rfc_7386(target: Any, patch: Any) -> None:
-    result = merge_patch(target, patch)
-    if not isinstance(patch, dict):
-        assert result == patch
-        return
+    result = overridden(target, patch, {})
     kept = target if isinstance(target, dict) else {}
     for key in {*kept, *patch}:
         if key not in patch:
             assert result[key] == kept[key]
         elif patch[key] is None:
             assert key not in result
+        elif isinstance(patch[key], dict):
+            assert result[key] == overridden(kept.get(key), patch[key], {})
         else:
-            assert result[key] == merge_patch(kept.get(key), patch[key])
+            assert result[key] == patch[key]
+
+
+DEFAULTS = {"limits": {"cpu": 1, "memory": 2}, "env": {}}
+
+
+@pytest.mark.parametrize(
+    ("values", "patches", "result", "in_helm"),
+    [
+        ({}, [{"limits": None}], {"limits": None}, {"env": {}}),
+        ({"limits": {"cpu": 3}}, [{"limits": None}], {"limits": None}, {"env": {}}),
+        ({}, [{"limits": {"cpu": None}}], {"limits": {"cpu": None}}, {"limits": {"memory": 2}}),
+        # a null that no default meets would reach the chart's templates, and fail its schema
+        (
+            {"env": {"A": "1", "B": "2"}, "x": 1},
+            [{"env": {"A": None}, "x": None}],
+            {"env": {"B": "2"}},
+            None,
+        ),
+        ({}, [{"limits": None}, {"limits": {"gpu": 1}}], None, {"limits": {"gpu": 1}, "env": {}}),
+        ({}, [{"limits": {"gpu": 1}}, {"limits": None}], {"limits": None}, {"env": {}}),
+        ({}, [{"limits": None}, {"limits": {"cpu": 4}}], None, {"limits": {"cpu": 4}, "env": {}}),
+        ({}, [{"env": {"A": "1"}}, {"env": {"A": None}}], {"env": {}}, DEFAULTS),
+    ],
+)
+def test_null_removes_what_the_template_wrote_and_what_the_chart_has(
+    values: dict[str, Any], patches: list[dict[str, Any]], result: Any, in_helm: Any
+) -> None:
+    for each in patches:
+        values = overridden(values, each, DEFAULTS)
+    assert result is None or values == result
+    coalesced = merged(DEFAULTS, values)
+    assert in_helm is None or coalesced == {"env": {}} | in_helm
+    assert None not in (*coalesced.values(), *coalesced.get("limits", {}).values())
 
 
 pins = st.sampled_from([{"tag": "x"}, {"tag": "y"}, {"repository": "z"}])
@@ -190,6 +223,6 @@ def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
     assert isinstance(shaped, ServiceRelease)
     values: Any = {}
     for _, patch in shaped.shaping.patches:
-        values = merge_patch(values, patch)
+        values = overridden(values, patch, None)
     images = {name: shaped.image(name, CONFIG) for name in release.service.images}
     return shaped.replicas, shaped.node, shaped.shaping.held, _text(values), images

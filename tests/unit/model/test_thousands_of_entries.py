@@ -19,13 +19,18 @@ from demandops.base.errors import Fault, InvalidInput
 from demandops.model.config.config import ConfigReader
 from demandops.model.config.load import load
 from demandops.model.config.override import by_rank
-from demandops.model.config.override_conflicts import check_override_conflicts, contested_effects
+from demandops.model.config.override_conflicts import check_override_conflicts
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import configuration, may_select_same_release, override
+from tests.kit.config import (
+    configuration,
+    contested_effects,
+    may_select_same_release,
+    override,
+)
 from tests.unit.decide.test_ties import _override, effects, selector
 
 Files = dict[str, str]

@@ -153,7 +153,7 @@ def test_what_people_write_of_a_node_is_read_back_as_it_was() -> None:
     selector = {label: label for label in LABELS} | {"a": ""}
     texts = ", ".join(f"{{key: {quoted(text)}, value: {quoted(text)}}}" for text in ANY_TEXT)
     labels = ", ".join(f'"{label}": "{text}"' for label, text in selector.items())
-    books = inventory([f"    id: n\n    tolerations: [{texts}]\n    selector: {{{labels}}}\n"])
+    books = inventory([f'    id: "n"\n    tolerations: [{texts}]\n    selector: {{{labels}}}\n'])
     books.send(goal([application(node="n")], [connection(ends=("n", "edge"))]))
     for content in books.rendered().values():
         both(content)
@@ -223,7 +223,7 @@ def test_what_no_reader_would_see_is_refused_in_an_id(text: str) -> None:
 
 @pytest.mark.parametrize(
     "value",
-    ["!!binary aGk=", "!!set {x}", "!!omap [x: 1]", "0x" + "f" * 5000, "9:" * 9000 + "9"],
+    ["!!binary aGk=", "!!set {x}", "!!omap [x: 1]", "!!int x", ".inf"],
     ids=lambda value: value[:10],
 )
 def test_what_json_or_a_program_cannot_hold_is_a_fault_of_its_file(value: str) -> None:
@@ -242,7 +242,7 @@ def test_a_file_that_is_too_long_is_not_parsed() -> None:
 
 @pytest.mark.parametrize("text", ["a: *b\n", "a: [", "a: \x00", "a: b: c", '"\\Uffffffff": 1'])
 def test_no_key_is_set_in_what_is_no_yaml(text: str) -> None:
-    with pytest.raises(InvalidInput, match="not valid YAML"):
+    with pytest.raises(InvalidInput, match=r"not valid YAML|anchors and aliases"):
         strict_yaml.set_key(text, "key", 1)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,40 @@ def readme(chart: Path) -> str:
     root = f"exports.{charts.EXPORT}" if chart == LIBRARY else ""
     metadata = yaml.safe_load((chart / "Chart.yaml").read_text())
     assert text.startswith(f"# {metadata['name']}\n\n{metadata['description']}\n")
-    return re.sub(r"(?s)\| Key \| Type.*?\n(?=\n|\Z)", lambda _: charts.table(values, root), text)
+    return re.sub(r"(?s)\| Key \| Type.*?\n(?=\n|\Z)", lambda _: table(values, root), text)
+
+
+_TYPES = {bool: "bool", int: "int", float: "float", str: "string", list: "list", dict: "object"}
+_HEAD = "| Key | Type | Default | Description |\n|-----|------|---------|-------------|\n"
+
+
+def table(text: str, root: str = "") -> str:
+    """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``."""
+    values: Any = yaml.safe_load(text)
+    prefix = f"{root}." if root else ""
+    words = {
+        path.removeprefix(prefix): description
+        for path, description in charts.descriptions(text).items()
+        if path.startswith(prefix)
+    }
+    for step in root.split(".") if root else ():
+        values = values[step]
+    rows = sorted(_rows(values, "", words, True), key=lambda row: row[0].lower())
+    return _HEAD + "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _rows(
+    values: Mapping[str, Any], prefix: str, words: Mapping[str, str], leaves: bool
+) -> Iterator[tuple[str, str, str, str]]:
+    for name, value in values.items():
+        path = f"{prefix}{name}"
+        nested = isinstance(value, dict) and bool(value)
+        if path in words or (leaves and not nested):
+            default = json.dumps(value, ensure_ascii=False, sort_keys=True, separators=(",", ":"))
+            yield path, _TYPES[type(value)], f"`{default}`", words.get(path, "")
+        if nested:
+            # below a mapping with a description, only values with one of their own are listed
+            yield from _rows(value, f"{path}.", words, leaves and path not in words)
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from demandops.base import addresses
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.settings import data_folder
 from demandops.cli.authoring import scaffold
@@ -25,7 +26,6 @@ from demandops.repo import new_repo
 from demandops.repo.merge_check import edited_checkout
 from demandops.templating.evaluator import EVALUATE
 
-_IMAGE = re.compile(r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:.*))?")
 _INPUT = re.compile(r"(?P<role>[^=]+)=(?P<type>.+)")
 _SHORT_TYPE = re.compile(r"(?P<package>\w+)/(?P<name>\w+)")
 _SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
@@ -289,14 +289,15 @@ def _service(text: str) -> ServicePlan:
 
 
 def _image(text: str) -> Image:
-    if not (match := _IMAGE.fullmatch(text)) or not (match["tag"] or match["digest"]):
+    try:
+        image = addresses.image(text)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--image") from None
+    if not (image.tag or image.digest):
         raise click.BadParameter(
             f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
         )
-    # not checked here, because `load` checks it with all the other new files
-    return Image.model_construct(
-        repository=match["repository"], tag=match["tag"], digest=match["digest"]
-    )
+    return Image(repository=image.name, tag=image.tag or None, digest=image.digest or None)
 
 
 # Maps an option to the arguments of `_asked` that ask for the option's values.

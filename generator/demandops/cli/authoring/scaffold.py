@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from demandops.base import strict_yaml
+from demandops.base.addresses import as_git_url
 from demandops.base.errors import InvalidInput
 from demandops.base.naming import PATTERN_WORDS
 from demandops.base.quoting import quoted
@@ -17,7 +18,6 @@ from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain, Rule, matches
 from demandops.model.config.registry import Image
-from demandops.model.config.repo_settings import as_git_url
 from demandops.templating import charts
 
 # ---- the text of YAML files that people edit ----
@@ -138,7 +138,6 @@ def application_files(
         ),
     }
     values = _filled(texts["chart-values.yaml"], given)
-    given["VALUES"] = charts.table(values).rstrip("\n")
     schema = charts.composed(
         f"Values of the chart {plan.name}",
         {"launch": _LAUNCH},

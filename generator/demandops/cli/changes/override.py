@@ -18,9 +18,9 @@ from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import Edit, EditOptions, selector, writable
 from demandops.cli.output import errors
 from demandops.cli.target import names_of
-from demandops.model.config.base_model import seconds_of
+from demandops.model.config.base_model import parse_time, seconds_of
 from demandops.model.config.load import is_override_name
-from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time, parse_time
+from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.repo.reader import Reader
 from demandops.views.release_causes import Entry
 

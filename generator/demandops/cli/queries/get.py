@@ -29,8 +29,7 @@ from demandops.cli.output import (
 )
 from demandops.cli.table import CellOf, Column, Table, column, joined, table_of
 from demandops.cli.target import name_options, names_of, state_repo_option
-from demandops.model.config.base_model import duration_text, relative
-from demandops.model.config.override import parse_time
+from demandops.model.config.base_model import duration_text, parse_time, relative
 from demandops.model.config.policy import matches
 from demandops.model.config.repo_settings import Proposals
 from demandops.model.demand.demand import Lease

@@ -15,8 +15,7 @@ from demandops.cli.json_output import Json, commit_data, output_formats, show, t
 from demandops.cli.output import busy
 from demandops.cli.table import Table, column, table_of
 from demandops.cli.target import name_options, state_repo_option
-from demandops.model.config.base_model import relative
-from demandops.model.config.override import parse_time
+from demandops.model.config.base_model import parse_time, relative
 from demandops.repo import reader
 from demandops.repo.history import revisions
 from demandops.repo.history.commit_log import LogEntry

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from graphlib import CycleError, TopologicalSorter
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, StringConstraints, model_validator
 
 from demandops.base import strict_yaml
-from demandops.base.errors import sentences, suggestion
+from demandops.base.errors import InvalidInput, sentences, suggestion
 from demandops.model.config import base_model, inventory
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId, PropertyName, Resources
@@ -51,17 +52,7 @@ class Sizes(CamelModel):
 
 
 class Scaling(CamelModel):
-    """How many replicas a service has.
-
-    A service has ``min`` replicas unless one of three fields decides the number. With ``per``, each
-    replica serves up to the given number of topics, sources, claims or requesters. With
-    ``sizes``, a parameter names a size, and each size has its number of replicas. ``autoscaler``
-    has the targets of a HorizontalPodAutoscaler, in percent of what the pods request.
-
-    ``divides_work`` says that no two replicas publish the same data.
-
-    No number is above ``max``, except one in ``sizes``.
-    """
+    """How many replicas a service has: ``min``, unless another field decides."""
 
     min: Count = 1
     max: Annotated[Count, Field(ge=1)] = 1
@@ -137,9 +128,30 @@ def ignored_fields(path: str, text: str) -> list[str]:
     return [field for field in strict_yaml.lines(text) if _IGNORED.fullmatch(field)]
 
 
+# The forms in which such a field may stand, and what stays in its place
+_FORMS = (
+    (re.compile(r",\s*downAfter:[^,}#\n]+"), ""),
+    (re.compile(r"downAfter:[^,}#\n]+,\s*"), ""),
+    (re.compile(r"^ *downAfter:.*\n?", re.MULTILINE), ""),
+    (re.compile(r"downAfter:[^,}#\n]+(?=})"), ""),
+    (re.compile(r"downAfter:[^#\n]*?(?= *(?:#|$))", re.MULTILINE), "{}"),
+)
+
+
 def without_ignored_fields(path: str, text: str) -> str:
+    """Return a definition's text without these fields; one in an odd form stays."""
     for field in ignored_fields(path, text):
-        text = strict_yaml.without_field(text, field)
+        with suppress(InvalidInput):  # it has several documents
+            wanted = scaling = strict_yaml.load(text)
+            for key in field.split(".")[:-1]:
+                scaling = scaling[key]
+            del scaling["downAfter"]
+            for form, left in _FORMS:
+                for match in form.finditer(text):
+                    shorter = text[: match.start()] + left + text[match.end() :]
+                    with suppress(InvalidInput):
+                        if strict_yaml.load(shorter) == wanted:
+                            return without_ignored_fields(path, shorter)
     return text
 
 
@@ -159,11 +171,7 @@ Scope = Literal["application", "topic", "node", "cluster"]
 
 
 class Place(CamelModel):
-    """Requirements on a service's node: its type, selector labels, capabilities and properties.
-
-    ``properties`` maps the name of a property to the value that the property must have. For a
-    number, there may be bounds instead of a value: ``{min: 8}``.
-    """
+    """Requirements on a service's node."""
 
     role: Word | Literal[""] = ""
     labels: dict[LabelKey, LabelValue] = Field(default_factory=dict)
@@ -172,11 +180,7 @@ class Place(CamelModel):
 
 
 class Input(CamelModel):
-    """An input, for example ``point_cloud``.
-
-    A demand gives topics to an input of an appdef. An appdef says where an input of a shared
-    service comes from.
-    """
+    """An input: topics of a demand, or of a shared service, whose origin an appdef gives."""
 
     description: Text = ""
     type: Text = ""
@@ -191,13 +195,7 @@ class Parameter(CamelModel):
 
 
 class Deployed(CamelModel):
-    """How a service runs (the names, chart and values of its releases), and what it publishes.
-
-    If ``each`` names an input, the service runs once for every topic of this input. ``place`` has
-    the requirements on the node, if the generator chooses a node for the service
-    (:mod:`.placement`). ``requests`` is how much of each resource a replica
-    requests of its node (:mod:`.capacity`).
-    """
+    """How a service runs (the names, chart and values of its releases), and what it publishes."""
 
     prefix: Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9]{0,9}$")]
     description: Text = ""
@@ -225,9 +223,8 @@ class Deployed(CamelModel):
 class OwnService(Deployed):
     """A service of one appdef.
 
-    ``inputs`` maps each input to its origin: a role of the appdef, or ``<service>.<output>``.
-    ``each`` names one of these inputs, or a role of the appdef. Such a role becomes an input of the
-    service.
+    ``inputs`` maps each input to its origin: a role of the appdef, or ``<service>.<output>``. A
+    role that only ``each`` names becomes an input, too.
     """
 
     inputs: dict[Word, str] = Field(default_factory=dict)
@@ -245,10 +242,7 @@ class OwnService(Deployed):
 
 
 class ServiceDefinition(Deployed, FileModel):
-    """A service that several appdefs may use: ``appdefs/<name>/service.yaml``.
-
-    For the scope ``cluster``, ``nodes`` maps each cluster to the node where the service runs.
-    """
+    """A service that several appdefs may use: ``appdefs/<name>/service.yaml``."""
 
     kind: Literal["ServiceDefinition"]
     name: DnsLabel
@@ -317,21 +311,14 @@ VersionPolicy = Literal["refuse", "separate", "update", "upgrade"]
 
 
 class WireNames(CamelModel):
-    """How the reference's ``DeploymentRequest`` names applications of this appdef.
-
-    ``type`` is the number that stands for this appdef in the field ``Application.type``. ``inputs``
-    maps a topic list in the message to the input of the appdef that gets these topics.
-    """
+    """How the reference's ``DeploymentRequest`` names applications of this appdef."""
 
     type: Annotated[int, Field(ge=1, le=255)]
     inputs: dict[Literal["ego_data_topics", "pointcloud_topics"], Word]
 
 
 class ApplicationDefinition(FileModel):
-    """One type of application: ``appdefs/<name>/appdef.yaml``.
-
-    ``uses`` lists the shared services, and where each input of a shared service comes from.
-    """
+    """One type of application: ``appdefs/<name>/appdef.yaml``."""
 
     kind: Literal["ApplicationDefinition"]
     name: DnsLabel

@@ -55,16 +55,27 @@ def duration_text(seconds: float) -> str:
     return text or "0s"
 
 
-def parse_timestamp(text: str) -> datetime:
+_TIME = re.compile(
+    r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,6})\d*)?([Zz]|[+-]\d\d:\d\d)", re.ASCII
+)
+
+
+def parse_time(text: str) -> datetime:
+    """Parse an RFC 3339 time that has a time zone, and return it in UTC."""
+    match = _TIME.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            f"{quoted(text)} is not a time with a time zone; write one like 2026-01-31T12:00:00Z"
+        )
+    day, clock, fraction, zone = match.groups("0")
+    zone = "+00:00" if zone in "Zz" else zone
     try:
-        moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
-        in_utc = moment.astimezone(timezone.utc)
+        moment = datetime.fromisoformat(f"{day}T{clock}.{fraction.ljust(6, '0')}{zone}")
+        return moment.astimezone(timezone.utc)
     except (ValueError, OverflowError):
-        message = f"{quoted(text)} is not a time like 2026-01-31T12:00:00.000000Z"
-        raise ValueError(message) from None
-    if moment.tzinfo is None:
-        raise ValueError(f"{quoted(text)} has no time zone; end it in Z")
-    return in_utc
+        raise ValueError(
+            f"{quoted(text)} is a time that does not exist; correct the date or the clock time"
+        ) from None
 
 
 def time_text(moment: datetime) -> str:
@@ -74,7 +85,7 @@ def time_text(moment: datetime) -> str:
 
 def _moment(value: object) -> datetime:
     if isinstance(value, str):
-        return parse_timestamp(value)
+        return parse_time(value)
     raise PydanticKnownError("string_type")
 
 

@@ -17,7 +17,7 @@ from pydantic import (
     model_validator,
 )
 
-from demandops.base import strict_yaml
+from demandops.base import addresses, strict_yaml
 from demandops.base.naming import id_problem, message_type_problem, topic_problem
 from demandops.base.quoting import quoted
 from demandops.model.config import base_model
@@ -167,14 +167,12 @@ def _number(value: str | float) -> float | None:
 # A node belongs to one cluster. It runs services only in access domains: in the one whose patterns
 # match it, and in those that it lists. A node selector identifies the node in its cluster.
 
-Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
+Host = Annotated[str, base_model.readable_by(addresses.host)]
 
 # A key in a Kubernetes Secret; in the pod, the key is a file's name
 SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
 
-_ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
-# A Zenoh endpoint whose protocol needs no certificates, like `tcp/host:7447`
-Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$"), base_model.Visible]
+Endpoint = Annotated[str, base_model.readable_by(addresses.endpoint)]
 
 
 class Tls(CamelModel):
@@ -195,9 +193,8 @@ class Credentials(CamelModel):
 class Zenoh(CamelModel):
     """The Zenoh bridge that a node runs when a connection needs it.
 
-    Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
-    the endpoint's port at every IPv4 address. It always connects to the routers in ``connect``. If
-    none of these fields is given, the bridge only connects to bridges that have an endpoint.
+    By default it listens on the endpoint's port at every IPv4 address, or every IPv6 address if the
+    endpoint is one. Without any field, it only connects to bridges that have an endpoint.
     """
 
     endpoint: Endpoint | None = None
@@ -216,8 +213,9 @@ class Zenoh(CamelModel):
     def listening(self) -> tuple[str, ...]:
         if self.listen or not self.endpoint:
             return self.listen
-        protocol, _, address = self.endpoint.partition("/")
-        return (f"{protocol}/0.0.0.0:{address.rpartition(':')[2]}",)
+        protocol, host, port = addresses.endpoint(self.endpoint)
+        everywhere = "[::]" if ":" in host else "0.0.0.0"  # noqa: S104
+        return (f"{protocol}/{everywhere}:{port}",)
 
 
 class Wan(CamelModel):
@@ -237,7 +235,7 @@ class Wan(CamelModel):
         return self
 
 
-_QUANTITY = re.compile(r"(\d{1,15})(?:\.(\d{1,3}))?(m|k|M|G|T|Ki|Mi|Gi|Ti)?")
+_QUANTITY = re.compile(r"([0-9]{1,15})(?:\.([0-9]{1,3}))?(m|k|M|G|T|Ki|Mi|Gi|Ti)?")
 _FACTORS = {"m": 1, "": 1000} | {
     unit: 1000 * base**power
     for base, units in ((1000, ("k", "M", "G", "T")), (1024, ("Ki", "Mi", "Gi", "Ti")))
@@ -352,11 +350,7 @@ class Position(CamelModel):
 
 
 class FurtherDomain(CamelModel):
-    """A further access domain of a node, besides the domain whose patterns match the node.
-
-    For connections of this domain, ``zenoh`` and ``wan`` replace those of the node, because two
-    programs cannot listen on one port.
-    """
+    """A further access domain of a node, besides the domain whose patterns match the node."""
 
     name: DnsLabel
     zenoh: Zenoh | None = None
@@ -364,11 +358,7 @@ class FurtherDomain(CamelModel):
 
 
 class Node(CamelModel):
-    """A C-ITS entity that runs services.
-
-    A demand may name the node, or say which ``type``, ``capabilities`` and ``properties`` a node
-    must have (:mod:`.placement`).
-    """
+    """A C-ITS entity that runs services."""
 
     id: NodeId
     # The role of the node; any word
@@ -443,11 +433,7 @@ def id_in_domain(node: str, domain: str) -> str:
 
 
 class Broker(CamelModel):
-    """A message broker and the node that it runs on.
-
-    If ``topic_prefix`` is given, every MQTT topic of a connection at this broker starts with
-    ``topic_prefix`` and ``/``.
-    """
+    """A message broker and the node that it runs on."""
 
     node: NodeId
     type: Literal["mqtt"] = "mqtt"

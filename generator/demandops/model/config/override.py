@@ -6,7 +6,6 @@ between two of them, and ``decide.planning.overrides`` applies overrides to rele
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -26,39 +25,19 @@ from demandops.model.config.base_model import (
     Items,
     Pattern,
     Visible,
+    parse_time,
 )
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.model.config.policy import matches
 from demandops.model.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
-from demandops.templating.charts import merge_patch
+from demandops.templating.charts import overridden
 
 OVERRIDES_ROOT = "overrides"
 
-_MOMENT = re.compile(
-    r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,6})\d*)?([Zz]|[+-]\d\d:\d\d)"
-)
 _SHAPING = ("values", "version", "images", "replicas", "node")
 _OF_SERVICES = ("version", "replicas", "node")
 # The effects of overrides, in the order in which messages list them
 EFFECTS = (*_SHAPING, "hold", "deny", "keep")
-
-
-def parse_time(text: str) -> datetime:
-    """Parse an RFC 3339 time that has a time zone, and return it in UTC."""
-    match = _MOMENT.fullmatch(text)
-    if match is None:
-        raise ValueError(
-            f"{quoted(text)} is not a time with a time zone; write one like 2026-01-31T12:00:00Z"
-        )
-    day, clock, fraction, zone = match.groups()
-    zone = "+00:00" if zone in "Zz" else zone
-    try:
-        moment = datetime.fromisoformat(f"{day}T{clock}.{(fraction or '0').ljust(6, '0')}{zone}")
-        return moment.astimezone(timezone.utc)
-    except (ValueError, OverflowError):
-        raise ValueError(
-            f"{quoted(text)} is a time that does not exist; correct the date or the clock time"
-        ) from None
 
 
 def format_time(moment: datetime) -> str:
@@ -72,14 +51,6 @@ def _one_line(text: str) -> str:
     if not text.isprintable():
         raise ValueError(f"{quoted(text)} is more than one line of plain text; write one line")
     return text
-
-
-def _finite(value: Any) -> None:  # noqa: ANN401 - Helm values are any data
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ValueError(f"contains {value}, which is not a number in JSON; choose another value")
-    inner = value.values() if isinstance(value, dict) else value
-    for item in inner if isinstance(value, dict | list) else ():
-        _finite(item)
 
 
 def _not_empty(items: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -105,7 +76,7 @@ class Selector(FrozenModel):
     """Selects the releases and claims that match every field given here.
 
     Patterns may contain ``*`` and ``?``. ``requesters`` matches if a pattern matches one requester
-    of the release or claim. ``labels`` matches if the node's selector has all of these labels.
+    of the release or claim.
     """
 
     applications: Patterns | None = None
@@ -149,9 +120,7 @@ class OverrideFile(FileModel):
     priority: Annotated[int, Field(ge=-1_000_000, le=1_000_000)] = 0
     expires: Annotated[str, base_model.readable_by(parse_time)] | None = None
     select: Annotated[Items[Selector], AfterValidator(_not_empty)]
-    values: (
-        Annotated[dict[str, Any], Field(min_length=1), base_model.readable_by(_finite)] | None
-    ) = None
+    values: Annotated[dict[str, Any], Field(min_length=1)] | None = None
     version: Annotated[str, StringConstraints(min_length=1, max_length=63), Visible] | None = None
     images: Annotated[dict[DnsLabel, ImagePin], Field(min_length=1)] | None = None
     replicas: Annotated[int, Field(ge=0, le=1000)] | None = None
@@ -273,7 +242,10 @@ Settings = TypeVar("Settings", bound=ClientSettings)
 
 
 def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
-    data = merge_patch(settings.model_dump(by_alias=True), patch)
+    data = overridden(settings.model_dump(by_alias=True), patch, {})
+    if isinstance(resources := data.setdefault("resources", {}), dict):
+        for name in ("requests", "limits"):  # null removes what a client has by default, too
+            resources.setdefault(name, {})
     own, of_mqtt = (
         {field.alias for field in model.model_fields.values()}
         for model in (type(settings), MqttClientSettings)

@@ -45,17 +45,21 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
             settings.append((("hold",), str(override.hold)))
         for what, token in settings:
             contests[override.priority, what].append((override, token))
-    rivals = defaultdict[str, dict[str, Override]](dict)
-    for contenders in contests.values():
+    # for each override, its rivals with what both set
+    rivals = defaultdict[str, dict[str, set[str]]](lambda: defaultdict(set))
+    for (_, what), contenders in contests.items():
         if len({token for _, token in contenders}) > 1:
             for rival, override in _rivals(contenders, config):
-                rivals[override.name][rival.name] = rival
+                name = ".".join(what[: 1 + (what[0] == "images")])
+                name = "what 'hold' freezes" if name == "hold" else f"'{name}'"
+                rivals[override.name][rival.name].add(name)
     for override in by_rank(config.overrides[name] for name in rivals):
-        for rival in by_rank(rivals[override.name].values())[:_MOST_SHOWN]:
-            names = " and ".join(f"'{name}'" for name in contested_effects(rival, override))
+        names = rivals[override.name]
+        for rival in by_rank(config.overrides[name] for name in names)[:_MOST_SHOWN]:
             message = (
-                f"is {override.priority}, as in {rival.path}, and both overrides may set {names} "
-                "of the same release; change one of the priorities, or select different releases"
+                f"is {override.priority}, as in {rival.path}, and both overrides may set "
+                f"{' and '.join(sorted(names[rival.name]))} of the same release; change one of the "
+                "priorities, or select different releases"
             )
             reader.add_fault(override.path, "priority", message)
 
@@ -129,35 +133,6 @@ def _rivals(
                     insort(starts, start)
                 earlier.setdefault(start, {}).setdefault(token, []).append((override, right))
         yield from ((rival, override) for rival in rivals.values())
-
-
-def contested_effects(first: Override, second: Override) -> list[str]:
-    contested = [
-        name
-        for name in _SINGLE
-        if None not in (left := getattr(first, name), right := getattr(second, name))
-        and left != right
-    ]
-    if first.values and second.values and not patches_commute(first.values, second.values):
-        contested.append("values")
-    pins = (first.images or {}, second.images or {})
-    contested += [
-        f"images.{name}"
-        for name in sorted({*pins[0]} & {*pins[1]})
-        if pins[0][name] != pins[1][name]
-    ]
-    for holding, shaping in ((first, second), (second, first)):
-        effects = [name for name in shaping.effects() if name in _FROZEN]
-        if holding.hold and effects:
-            contested += ["hold", *effects]
-    return contested
-
-
-def patches_commute(first: object, second: object) -> bool:
-    if isinstance(first, Mapping) and isinstance(second, Mapping):
-        return all(patches_commute(first[key], second[key]) for key in first if key in second)
-    # unlike ==, JSON distinguishes 1 from True
-    return json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)
 
 
 def may_match_same_release(

@@ -37,10 +37,8 @@ def _compiled(pattern: str) -> Callable[[str], object]:
 class Rule(CamelModel):
     """Which demands some requesters may make. Each requester of a demand needs a rule that fits.
 
-    ``nodes`` are the nodes of applications and the ends of connections. ``brokers`` are the nodes
-    of brokers. ``peers`` are the other access domains that connections may come from and go to.
-    ``manages`` are patterns of requesters whose demands the rule's requesters may change, renew and
-    release, although they did not book them. ``approval`` defaults to that of the access domain.
+    ``nodes`` are the nodes of applications and the ends of connections. ``approval`` defaults to
+    that of the access domain.
     """
 
     name: DnsLabel
@@ -57,7 +55,6 @@ class Quotas(CamelModel):
     """The upper limits of an access domain. A field that is not given sets no limit.
 
     What exceeds a limit already, because the limit was lowered, may stay, but not grow.
-    ``demands_per_minute`` limits the demands that one generator receives from a requester.
     """
 
     claims_per_requester: base_model.Positive | None = None
@@ -69,14 +66,8 @@ class LeasePolicy(CamelModel):
     """The time that a demand's claims stay booked without a renewal.
 
     A demand that requests no lease gets ``default``, or ``longest`` if there is no ``default``. If
-    neither is set, the demand's claims last forever.
-
-    If ``deployment_requests`` is true, goals of the reference's ``DeploymentRequest`` get the
-    default lease. Their client must send a goal again before its lease ends. Otherwise their claims
-    last forever.
-
-    The recorded end of a lease may lag behind the last renewal by ``slack``, so the generator may
-    release a claim late by that much.
+    neither is set, or the goal is a ``DeploymentRequest`` and ``deployment_requests`` is false, its
+    claims last forever. The generator may release a claim late by ``slack``.
     """
 
     default: Duration | None = None
@@ -170,18 +161,7 @@ class AccessDomain(CamelModel):
     """Nodes, the namespace and service account of their releases, and who may demand what there.
 
     Without ``rules``, all requesters may demand anything on its nodes, and no connection leaves the
-    domain. ``kinds`` are the kinds of objects that its charts may have (:attr:`allowed_kinds`).
-    ``pod_security`` limits what its pods may do: ``baseline`` is the level of this name in
-    Kubernetes' Pod Security Standards, ``host-network`` also permits the host's network, and
-    ``privileged`` permits everything.
-
-    ``when_full`` says what happens to a demand if the nodes that suit it have no room
-    (:mod:`.records`).
-
-    ``ros`` replaces the ROS domain of the nodes. ``broker`` is the node of the broker for
-    connections that name none and have none at an end: that of the target's domain, or else of the
-    source's. ``broker_credentials`` maps the node of a broker to the credentials that connection
-    ends in this domain use for the broker.
+    domain. ``broker`` is that of the target's domain, or else of the source's.
     """
 
     name: DnsLabel

@@ -5,7 +5,6 @@ A chart is in a folder of the state repo, an OCI registry or an HTTP chart repos
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,18 +12,19 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
+from demandops.base import addresses
 from demandops.base.errors import sentences, suggestion
 from demandops.model.config import base_model
-from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel, Visible
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel
 from demandops.model.config.inventory import Rmw
 
 ChartVersion = Annotated[
-    str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
+    str, StringConstraints(pattern=r"^[0-9]+\.[0-9]+\.[0-9]+(-[0-9A-Za-z.-]+)?$", max_length=40)
 ]
 
 ChartFolder = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
 
-Repository = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")]
+Repository = Annotated[str, base_model.readable_by(addresses.repository)]
 Tag = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")]
 Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
 
@@ -34,8 +34,8 @@ class ChartSource(FrozenModel):
 
     version: ChartVersion
     folder: ChartFolder | None = None
-    oci: Annotated[str, StringConstraints(pattern=r"^oci://[^\s]+$"), Visible] | None = None
-    http: Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$"), Visible] | None = None
+    oci: Annotated[str, base_model.readable_by(addresses.oci_chart)] | None = None
+    http: Annotated[str, base_model.readable_by(addresses.http_chart)] | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> ChartSource:
@@ -45,21 +45,13 @@ class ChartSource(FrozenModel):
                 "needs exactly one of folder, oci and http"
                 + (f", not {' and '.join(given)}" if given else "")
             )
-        if re.search(r"://[^/\s]*@", self.http or self.oci or ""):
-            raise ValueError(
-                "must not contain a user or password; give them to the GitOps controller as a "
-                "Secret"
-            )
         if self.folder and ".." in self.folder.split("/"):
             raise ValueError("'folder' must stay inside the state repo; remove '..'")
         return self
 
 
 class Chart(ChartSource):
-    """A Helm chart: its default version, and further versions by channel.
-
-    A demand may request a channel by name, or one of the versions.
-    """
+    """A Helm chart: its default version, and further versions, which a demand may request."""
 
     channels: dict[base_model.Word, ChartSource] = Field(default_factory=dict)
 
@@ -103,11 +95,8 @@ class Image(FrozenModel):
         return self
 
     def pulled_from(self, registry: str) -> Image:
-        host, _, path = self.repository.partition("/")
-        # Docker's rule: only such a first part is a host
-        has_host = path and ("." in host or ":" in host or host == "localhost")
-        repository = f"{registry}/{path if has_host else self.repository}"
-        return self.model_copy(update={"repository": repository})
+        path = addresses.repository(self.repository).path
+        return self.model_copy(update={"repository": f"{registry}/{path}"})
 
     def parts(self) -> dict[str, str]:
         return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
@@ -126,21 +115,17 @@ class ChartsFile(FileModel):
 
 
 class ImagesFile(FileModel):
-    """``registry/images.yaml``, and files of ``registry/images/``.
-
-    If a file gives a ``registry``, all images of the file are pulled from this registry.
-    """
+    """``registry/images.yaml``, and files of ``registry/images/``."""
 
     kind: Literal["Images"]
-    registry: Repository | None = None
+    registry: Annotated[str, base_model.readable_by(addresses.registry)] | None = None
     images: dict[DnsLabel, Image]
 
 
 class ImagePin(FrozenModel):
-    """What a version or an override changes of an image in ``registry/images.yaml``.
+    """What a version or an override changes of an image; an absent field changes nothing.
 
-    An absent field changes nothing, except that a new tag removes the image's digest, and a new
-    digest its tag (:meth:`over`).
+    But a new tag removes the image's digest, and a new digest its tag (:meth:`over`).
     """
 
     repository: Repository | None = None
@@ -164,18 +149,17 @@ class ImagePin(FrozenModel):
 
 
 class VersionContents(CamelModel):
-    """The charts and images of one version of an application.
-
-    A chart that is not listed has its default version. An image that is not listed stays as
-    ``registry/images.yaml`` has it.
-    """
+    """The charts and images of a version, where they are not the default ones."""
 
     charts: dict[DnsLabel, ChartVersion] = Field(default_factory=dict)
     images: dict[DnsLabel, ImagePin] = Field(default_factory=dict)
 
 
 class VersionList(CamelModel):
-    """The versions of one application definition, its default version, and its channels."""
+    """The versions of one application definition, its default version, and its channels.
+
+    A definition without this has no versions of its own: those of its charts count.
+    """
 
     default: ChartVersion
     channels: dict[base_model.Word, ChartVersion] = Field(default_factory=dict)
@@ -195,10 +179,7 @@ class VersionList(CamelModel):
 
 
 class VersionsFile(FileModel):
-    """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none.
-
-    A definition without an entry here has no versions of its own: those of its charts count.
-    """
+    """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none."""
 
     kind: Literal["Versions"]
     applications: dict[DnsLabel, VersionList]
@@ -238,7 +219,7 @@ class ApplicationVersion:
 
 
 _EnvName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-_Quantity = Annotated[str, StringConstraints(pattern=r"^\d+(\.\d+)?(m|k|Ki|M|Mi|G|Gi)?$")]
+_Quantity = Annotated[str, StringConstraints(pattern=r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi)?$")]
 _Resource = Annotated[str, StringConstraints(pattern=r"^[a-z0-9./-]+$")]
 _LaunchFile = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]+$")]
 _Package = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*$")]
@@ -264,11 +245,7 @@ class Resources(FrozenModel):
 
 
 class ClientSettings(CamelModel):
-    """How the client containers of one connection type run.
-
-    Without ``host_network``, a client uses the setting of its node. Each probe has the form of a
-    Kubernetes core/v1 Probe.
-    """
+    """How the client containers of one connection type run; probes are as in Kubernetes."""
 
     env: Annotated[dict[_EnvName, base_model.Text], AfterValidator(_free)] = Field(
         default_factory=dict
@@ -281,11 +258,7 @@ class ClientSettings(CamelModel):
 
 
 class MqttClientSettings(ClientSettings):
-    """The settings of MQTT clients, which are ROS nodes.
-
-    Without ``rmw``, a client uses the middleware of its node. ``messages`` are the packages whose
-    messages the image can carry; an empty list means that these packages are not known.
-    """
+    """The settings of MQTT clients, which are ROS nodes."""
 
     launch_file: _LaunchFile = "standalone.launch.xml"
     rmw: Rmw | None = None

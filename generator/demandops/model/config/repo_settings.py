@@ -2,42 +2,34 @@
 
 from __future__ import annotations
 
-import re
 from typing import Annotated, Literal
+from urllib.parse import urlsplit
 
 from pydantic import StringConstraints, model_validator
 
+from demandops.base.addresses import as_git_url, holds_secret, url, without_secrets
 from demandops.base.quoting import quoted
 from demandops.model.config import base_model
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel, Positive
 
 ROOT_FILE = "demandops.yaml"
 
-_GIT_URL = re.compile(r"(https?|ssh)://[^\s:@]+(@[^\s:@]+)?(:\d+)?/\S+")
-_SCP = re.compile(r"(?P<user>[^\s:@/]+)@(?P<host>[^\s:@/]+):(?!\d+/)(?P<path>[^\s/]\S*)")
-
-
-def as_git_url(text: str) -> str:
-    # `git@host:path` is Git's short form of a URL
-    scp = _SCP.fullmatch(text)
-    return f"ssh://{scp['user']}@{scp['host']}/{scp['path']}" if scp else text
-
 
 # The address is in files of the repo and in the clusters, so it must not hold a password. Git's
 # short form `user@host:path` is refused, because the controllers read only URLs.
-def _git_url_problem(text: str) -> str:
-    if _GIT_URL.fullmatch(text):
-        return ""
-    url = as_git_url(text)
-    if url != text:
-        return f"{quoted(text)} is not a URL, but the GitOps controllers need one; write {url}"
-    return (
-        f"{quoted(text)} is not a URL that clusters can fetch; write https://HOST/PATH or "
-        "ssh://USER@HOST/PATH, without a password or token"
-    )
+def _git_url(text: str) -> None:
+    if (long := as_git_url(text)) != text:
+        raise ValueError(
+            f"{quoted(text)} is not a URL, but the GitOps controllers need one; write {long}"
+        )
+    if holds_secret(text) or len(url(text, "https", "ssh", "http").path) < 2:
+        raise ValueError(
+            f"{quoted(without_secrets(text))} is not a URL that clusters can fetch; write "
+            "https://HOST/PATH or ssh://USER@HOST/PATH, without a password or token"
+        )
 
 
-GitUrl = Annotated[str, base_model.without(_git_url_problem), base_model.Visible]
+GitUrl = Annotated[str, base_model.readable_by(_git_url)]
 
 
 class Flux(FrozenModel):
@@ -48,46 +40,37 @@ class Flux(FrozenModel):
 
     url: GitUrl | None = None
     interval: Annotated[
-        str, StringConstraints(pattern=r"^(\d+h)?(\d+m)?(\d+s)?$", min_length=2)
+        str, StringConstraints(pattern=r"^([0-9]+h)?([0-9]+m)?([0-9]+s)?$", min_length=2)
     ] = "1m"
     secret: DnsLabel | None = None
 
 
 class ArgoCd(FrozenModel):
-    """How Argo CD fetches this repo, and the namespace that Argo CD runs in.
-
-    Argo CD finds the credentials in a Secret of this namespace. The Secret names the URL.
-    """
+    """How Argo CD fetches this repo, and its namespace, in which a Secret has the credentials."""
 
     url: GitUrl
     namespace: DnsLabel = "argocd"
 
 
 # A token is sent there, so plain HTTP is only for this machine
-_WEB_URL = re.compile(
-    r"(https://[^\s:@/?#]+|http://(127\.0\.0\.1|localhost|\[::1\]))(:\d+)?(/[^\s?#]*)?"
-)
+def _web_url(text: str) -> None:
+    parts = url(text, "https", "http")
+    is_safe = parts.scheme == "https" or parts.hostname in ("127.0.0.1", "localhost", "::1")
+    if not is_safe or parts.query or parts.fragment or "@" in parts.netloc:
+        raise ValueError(
+            f"{quoted(without_secrets(text))} is not an address that a token may be sent to; write "
+            "https://HOST/PATH, without a user (plain http only for this machine)"
+        )
 
 
-def _web_url_problem(text: str) -> str:
-    if _WEB_URL.fullmatch(text):
-        return ""
-    return (
-        f"{quoted(text)} is not an address that a token may be sent to; write "
-        "https://HOST/PATH, without a user (plain http only for this machine)"
-    )
-
-
-WebUrl = Annotated[str, base_model.without(_web_url_problem), base_model.Visible]
+WebUrl = Annotated[str, base_model.readable_by(_web_url)]
 
 
 class Proposals(FrozenModel):
     """The forge where the generator proposes demands that need approval.
 
     With ``none``, the generator pushes the proposal's branch, but opens no pull request. With
-    GitLab, the push options of the branch open a merge request. With GitHub and Gitea (Forgejo),
-    the generator opens a pull request through the API, whose address follows from ``url`` unless
-    ``api`` gives it.
+    GitLab, the push options of the branch open a merge request. With the others, the API does so.
     """
 
     forge: Literal["none", "gitlab", "github", "gitea"] = "none"
@@ -114,19 +97,15 @@ class Proposals(FrozenModel):
     @property
     def project(self) -> tuple[str, ...]:
         # owner and name: the last two parts of the path in `url`
-        path = (self.url or "").partition("://")[2].partition("/")[2]
-        return tuple(path.strip("/").removesuffix(".git").split("/")[-2:]) if path else ()
+        path = urlsplit(self.url or "").path.strip("/")
+        return tuple(path.removesuffix(".git").split("/")[-2:]) if path else ()
 
 
 class Limits(CamelModel):
     """The sizes above which a demand is refused.
 
-    ``demand_characters`` limits the length of the whole demand. ``demand_items`` limits how many
-    things (applications, connections, topics, requesters and so on) the demand lists in total,
-    together with the connections that it needs. ``parameter_bytes`` limits the parameters of an
-    application, written as JSON. ``file_bytes`` limits each file that the generator writes for the
-    demand, because Kubernetes stores no object above 1.5 MB. ``decision_milliseconds`` limits the
-    processor time in which a generator decides the demand, because other demands wait meanwhile.
+    ``demand_items`` counts also the connections that a demand needs. ``file_bytes`` is less than
+    the 1.5 MB that Kubernetes stores. Other demands wait for ``decision_milliseconds``.
     """
 
     demand_characters: Positive = 1_000_000
@@ -139,9 +118,7 @@ class Limits(CamelModel):
 class RepoSettings(FileModel):
     """``demandops.yaml``: the settings of the whole state repo.
 
-    The file may contain both ``flux`` and ``argocd``. Only the section that ``gitops`` names is
-    used. ``placement`` is the rule by which the generator chooses among the nodes that fit an
-    application (:mod:`.placement`).
+    Only the section that ``gitops`` names is used.
     """
 
     kind: Literal["StateRepository"]

@@ -13,8 +13,8 @@ from rpds import HashTrieMap
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.base.settings import LEDGER_API_VERSION
-from demandops.model.config.base_model import FrozenModel, Moment, parse_file, time_text
-from demandops.model.config.override import Override, format_time, parse_time
+from demandops.model.config.base_model import FrozenModel, Moment, parse_file, parse_time, time_text
+from demandops.model.config.override import Override, format_time
 from demandops.model.demand.demand import Demand, Operation
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.claim import LEDGER_ROOT, segment

@@ -12,12 +12,13 @@ from pathlib import Path
 import pygit2
 from pygit2 import Oid, Repository
 
+from demandops.base.addresses import holds_secret
 from demandops.base.errors import StateRepoError, Unsound
 from demandops.base.quoting import quoted
 from demandops.base.settings import MAIN_BRANCH
 from demandops.repo.git import repository as repositories
 from demandops.repo.git.objects import NewObjects, sync_folder
-from demandops.repo.git.remote_repository import HAS_PASSWORD, HAS_TOKEN, Notify, RemoteRepository
+from demandops.repo.git.remote_repository import Notify, RemoteRepository
 from demandops.repo.git.repository import PushDenied, StateRepository, Unavailable
 
 # ---- a bare repository on this disk ----
@@ -293,7 +294,7 @@ def _check_url(url: str) -> None:
         raise StateRepoError(
             f"a state repo's address cannot start with '{scheme[0]}'; use https, ssh, git or file"
         )
-    if HAS_PASSWORD.search(url) or HAS_TOKEN.match(url):
+    if holds_secret(url):
         raise StateRepoError(
             "the state repo's address holds a password or token, which process lists would show; "
             "remove it and use a credential helper, ~/.netrc or an SSH key"

@@ -16,6 +16,7 @@ import git
 import pygit2
 from pygit2 import Oid, Repository
 
+from demandops.base.addresses import without_secrets
 from demandops.base.errors import StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
@@ -94,21 +95,9 @@ _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
 )
 
-_USER = re.compile(r"(://)[^/@\s]*@")
-
-HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
-# A URL whose user name is a token. Other user names are allowed, because some forges need one.
-HAS_TOKEN = re.compile(
-    r"^https?://(gh[a-z]_|github_pat_|gl[a-z]+-|ATBB|ATCTT|(?=[a-zA-Z]*\d)[a-zA-Z0-9]{32,}@)", re.I
-)
 Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")
-
-
-def without_secrets(text: str) -> str:
-    # first what surely has a password, which may itself have an @; then each user name
-    return _USER.sub(r"\1", HAS_PASSWORD.sub(r"\1", text))
 
 
 class RemoteRepository(repositories.StateRepository):
