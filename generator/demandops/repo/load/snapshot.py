@@ -182,6 +182,11 @@ def configuration_of(repo: Repository, commit: Commit, entry: LogEntry | None) -
     return found
 
 
+# By the commit of a configuration, the newest one along whose first parents it was found. Each commit
+# made while another is not valid would else be followed back to it.
+_on_line_of: dict[Oid, Oid] = {}
+
+
 def _on_line(repo: Repository, to: Oid, configuration: Oid) -> Oid | None:
     """Return ``configuration``, or if people have rewritten main, a commit with the same files.
 
@@ -191,7 +196,8 @@ def _on_line(repo: Repository, to: Oid, configuration: Oid) -> Oid | None:
     wanted, same = trees.commit_of(repo, configuration), None
     ids = config_ids(wanted.tree)
     for commit in commit_log.first_parents(repo, to):
-        if commit.id == configuration:
+        if commit.id in (configuration, _on_line_of.get(configuration)):
+            _on_line_of[configuration] = to
             return configuration
         if same is None and config_ids(commit.tree) == ids:
             same = commit.id
