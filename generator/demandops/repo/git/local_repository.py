@@ -32,7 +32,7 @@ log = logging.getLogger("demandops")
 class LocalRepository(StateRepository):
     """A repository on this disk, written in place and fsynced; nobody may have main checked out."""
 
-    always_current = True
+    always_current = on_this_disk = True
 
     def __init__(self, path: Path) -> None:
         self.address = str(path)
@@ -125,6 +125,11 @@ class LocalRepository(StateRepository):
     def publish(self, expected: Oid, commit: Oid) -> bool:
         if self.tip() != expected:
             return False
+        if needs_push(self.objects.path):
+            raise Unavailable(
+                f"{self.address} got hooks or settings that only `git push` obeys; start again to "
+                "use it"
+            )
         reference = self.objects.references[repositories.MAIN]
         try:
             with self.new.packed(commit):
@@ -179,6 +184,46 @@ class LocalRepository(StateRepository):
                     f"{self.address} cannot be written: {lock} cannot be removed "
                     f"({error.strerror}); remove it"
                 ) from None
+
+
+# ---- a bare repository on this disk that only git can write as its owner wants ----
+
+_HOOKS = ("pre-receive", "update", "post-receive", "post-update", "reference-transaction")
+# What a push may do, and who may read what it writes. The objects that this program makes would
+# pass git's check of objects, and it always keeps them packed.
+_SETTINGS = re.compile(
+    r"core\.sharedrepository|hook\..*|(receive|transfer)\.(?!fsckobjects$|unpacklimit$).*"
+)
+
+
+def needs_push(address: str) -> bool:
+    """Return whether a folder has a repository with hooks or settings that only git obeys."""
+    try:
+        repo = Repository(str(Path(address).expanduser()))
+    except (pygit2.GitError, RuntimeError, ValueError):
+        return False
+    settings = {entry.name.lower(): entry.value or "" for entry in repo.config}
+    hooks = Path(repo.path, Path(settings.get("core.hookspath", "hooks")).expanduser())
+    return any(map(_SETTINGS.fullmatch, settings)) or any(
+        (hooks / name).is_file() and os.access(hooks / name, os.X_OK) for name in _HOOKS
+    )
+
+
+class PushedRepository(RemoteRepository):
+    on_this_disk = True
+
+    def __init__(self, place: LocalRepository, folder: Path, notify: Notify) -> None:
+        self._place = place
+        super().__init__(str(Path(place.objects.path).resolve()), folder, notify, False)
+
+    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
+        # to look is cheap, to fetch is not
+        is_new = self._place.tip() != self.tip()
+        return super().refresh(urgent) if is_new else self.tip()
+
+    def tidy(self) -> None:
+        super().tidy()
+        self._place.tidy()
 
 
 # ---- what is only read: a person's checkout, and the last fetch of a URL ----
@@ -260,8 +305,8 @@ def connect(
 ) -> StateRepository:
     """Return the state repo at an address: a URL, or a folder where main is not checked out.
 
-    The clone of a URL is made in ``folder``; with ``allow_offline``, an existing one is used if its
-    remote is away. With ``only_read``, the address may also be the folder of a checkout.
+    The clone of what is pushed to is made in ``folder``; with ``allow_offline``, an existing one is
+    used if its remote is away. With ``only_read``, the address may also be that of a checkout.
     """
     if is_url(address):
         _check_url(address)
@@ -283,7 +328,12 @@ def connect(
             f"{address} does not exist{place}; correct the path, or make a state repo there with "
             f"`demandops init {address} --bare`"
         )
-    return Checkout(path) if is_read_only else LocalRepository(path)
+    if is_read_only:
+        return Checkout(path)
+    repository = LocalRepository(path)
+    if only_read or not needs_push(address):
+        return repository
+    return PushedRepository(repository, folder / "clone.git", notify)
 
 
 def _check_url(url: str) -> None:

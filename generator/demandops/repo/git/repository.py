@@ -145,6 +145,7 @@ class StateRepository(ABC):
     # called again and again while this waits for git
     while_waiting: Callable[[], object] = staticmethod(lambda: None)
     always_current: bool  # whether the tip needs no fetch, as in a repository on this disk
+    on_this_disk = False  # whether it costs nearly nothing to look for new commits
     _tidying: subprocess.Popen[bytes] | None = None
     # of the tip: main, its remote-tracking branch, or HEAD of a checkout
     main_reference = MAIN
