@@ -353,6 +353,8 @@ def test_a_checkout_that_lacks_a_file_is_told_by_check(
     folder = tmp_path / "checkout"
     rig.git(tmp_path, "clone", "--quiet", "--no-local", str(bare), str(folder))
     lost = lose(folder / ".git", tmp_path, "HEAD:demandops.yaml")
+    with (folder / "demandops.yaml").open("a") as file:
+        file.write("# git would store the lost content again\n")
     told = demandops("check", folder)
     assert told.code == 1
     assert f"demandops.yaml of commit {rig.git(folder, 'rev-parse', 'HEAD')[:10]}" in told.err

@@ -91,10 +91,7 @@ class LocalRepository(StateRepository):
             )
         self.new.clean()
         self.tip()
-        # what `git clone --filter` writes into the configuration
-        filtered = (".promisor", ".partialclonefilter")
-        is_partial = any(entry.name.endswith(filtered) for entry in self.objects.config)
-        if self.objects.is_shallow or is_partial:
+        if self.objects.is_shallow or repositories.lacks_objects(self.objects):
             raise StateRepoError(
                 f"{path} is a clone that lacks a part of the history or of the files; clone the "
                 "state repo again, without --depth and --filter"

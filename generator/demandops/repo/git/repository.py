@@ -95,13 +95,43 @@ def missing_main(address: str) -> StateRepoError:
     )
 
 
+PARTIAL = (
+    "{0} is a clone that was made with --filter and lacks objects; fetch them: "
+    "git -C {0} fetch --refetch --no-filter origin"
+)
+
+
+def lacks_objects(repo: Repository) -> bool:
+    # by what `git clone --filter` writes into the configuration
+    filtered = (".promisor", ".partialclonefilter")
+    return any(entry.name.endswith(filtered) for entry in repo.config)
+
+
 def unopened(folder: Path, error: Exception) -> StateRepoError | None:
     """Return the error to raise if Git cannot open a folder; None if it is no Git repository."""
     if not ((folder / ".git").exists() or (folder / "HEAD").is_file()):
-        return None
+        return _within_another(folder)
     return StateRepoError(
         f"{folder} is a Git repository that cannot be opened: {error}; if it belongs to another "
         f"user, run `git config --global --add safe.directory {folder.resolve()}`"
+    )
+
+
+def _within_another(folder: Path) -> StateRepoError | None:
+    try:
+        around = pygit2.discover_repository(str(folder))
+        repo = Repository(around) if around else None
+    except pygit2.GitError:
+        return None
+    if repo is None or not repo.workdir:
+        return None
+    path = folder.resolve().relative_to(Path(repo.workdir).resolve())
+    if repo.path_is_ignored(f"{path}/"):
+        return None
+    return StateRepoError(
+        f"{folder} is a folder of the Git repository {repo.workdir}, but a state repo is a "
+        "repository of its own; make it one, for example with "
+        f"`git subtree split --prefix={path} -b fleet`"
     )
 
 
@@ -113,6 +143,8 @@ def access_error(error: Exception, address: str, objects: Repository | None = No
         return error
     # the text of a KeyError would have quotes
     what = str(error.args[0]) if isinstance(error, KeyError) else str(error)
+    if objects is not None and lacks_objects(objects):
+        return StateRepoError(PARTIAL.format(address))
     if objects is not None and (oid := re.search("[0-9a-f]{40}", what)):
         place = trees.place_of(Repository(objects.path), Oid(hex=oid[0]))
         what = f"{place}, Git object {oid[0]}, is missing or damaged" if place else what

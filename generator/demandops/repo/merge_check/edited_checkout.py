@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import os
 import re
-import stat
-from collections.abc import Mapping
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pygit2
-from pygit2 import Commit, Repository
+from pygit2 import Commit, Repository, Tree
 
 from demandops.base import strict_yaml
-from demandops.base.errors import Fault, InvalidInput, StateRepoError, fault
+from demandops.base.errors import InvalidInput, StateRepoError, fault
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import API_VERSION, GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT, modeline
@@ -24,10 +27,12 @@ from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.override import OVERRIDES_ROOT
+from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.release import Release, ServiceRelease
+from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
-from demandops.repo.git.repository import reading, unopened
+from demandops.repo.git.repository import PARTIAL, lacks_objects, reading, unopened
 from demandops.repo.history import revisions
 from demandops.repo.load import snapshot as snapshots
 
@@ -133,14 +138,149 @@ def _merge_patch(
     return patch
 
 
-# ---- the checkout: its files, and the commit that an edit started from ----
+# ---- the tree that Git would make of a checkout ----
+#
+# What counts is what Git would commit: what filters and conversions of line ends make of the files,
+# without ignored ones. So git itself makes the tree, in a temporary index and folder of objects.
+# It runs only filters that the configuration of this machine names.
 
-_ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
-_DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
+ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 # A fleet of 20,000 nodes has fewer; more would fill the memory of the machine that checks.
 _MOST_BYTES = 16 << 20
 _MOST_BYTES_IN_ALL = 1 << 30
 _MOST_FILES = 500_000
+_MOST_SECONDS = 600
+_UNMERGED = (b"DD", b"AU", b"UD", b"UA", b"DU", b"AA", b"UU")  # as `git status` marks them
+_NO_CODE = (
+    *("-c", "core.fsmonitor=false", "-c", f"core.hooksPath={os.devnull}"),
+    *("-c", "core.splitIndex=false"),  # or git would write into the checkout's repository
+)
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[tuple[Repository, Tree]]:
+    """Yield a checkout's repository, and the tree that git would make of the files in ``ROOTS``.
+
+    Files without Git are in an empty repository meanwhile.
+    """
+    with TemporaryDirectory(prefix="demandops-check-") as scratch:
+        try:
+            repo = Repository(str(folder))
+        except pygit2.GitError as error:
+            if reason := unopened(folder, error):
+                raise reason from None
+            repo = pygit2.init_repository(f"{scratch}/empty.git", bare=True)
+        else:
+            if repo.is_bare:
+                raise StateRepoError(
+                    f"{folder} is a bare repository, which has no files to edit; clone it, and use "
+                    f"the clone: git clone {folder}"
+                )
+        with reading(str(folder), repo):
+            tree = _written_tree(folder, repo, Path(scratch))
+            if ROOT_FILE not in tree:
+                raise StateRepoError(
+                    f"{folder} is not a state repo, because it has no {ROOT_FILE}; name a checkout "
+                    "of one, or make one with `demandops init`"
+                )
+            yield repo, tree
+
+
+def _written_tree(folder: Path, repo: Repository, scratch: Path) -> Tree:
+    own, shared, objects = Path(repo.path), Path(repo.path, "commondir"), scratch / "objects"
+    if shared.is_file():  # of a linked work tree
+        shared = own / shared.read_text().strip()
+    store = (shared if shared.is_dir() else own).resolve() / "objects"
+    (objects / "info").mkdir(parents=True)
+    (objects / "info" / "alternates").write_text(f"{store}\n")
+    if (own / "index").is_file():
+        # with its time, after which git reads files again whose size and time are as before
+        shutil.copy2(own / "index", scratch / "index")
+
+    def git(*arguments: str, stdin: bytes = b"") -> bytes:
+        environment = {
+            "GIT_DIR": str(own),
+            "GIT_WORK_TREE": str(folder.resolve()),
+            "GIT_INDEX_FILE": str(scratch / "index"),
+            "GIT_OBJECT_DIRECTORY": str(objects),
+            # a partial clone must not fetch; before Git 2.44 only the latter prevents that
+            **{"GIT_NO_LAZY_FETCH": "1", "GIT_ALLOW_PROTOCOL": "none"},
+        }
+        done = subprocess.run(
+            ["git", "--literal-pathspecs", *_NO_CODE, *arguments],
+            cwd=folder,
+            env=os.environ | child_processes.mark() | environment,
+            input=stdin,
+            capture_output=True,
+            check=False,
+            timeout=_MOST_SECONDS,
+        )
+        if done.returncode and lacks_objects(repo):
+            raise StateRepoError(PARTIAL.format(folder))
+        if done.returncode:
+            told = done.stderr.decode(errors="replace").strip().splitlines()
+            raise StateRepoError(
+                f"{folder} cannot be read as git would commit it: {(told or ['git failed'])[-1]}; "
+                "mend it until `git add --all` succeeds"
+            )
+        return done.stdout
+
+    status = ("status", "--porcelain", "-z", "--no-renames", "--ignore-submodules=dirty")
+    listed = git(*status, "--untracked-files=all", "--", *ROOTS).split(b"\0")[:-1]
+    # git must not read what is refused afterwards
+    _refuse(_why_not_added(folder, entry[:2], entry[3:]) for entry in listed)
+    git("add", "--update")
+    new = [entry[3:] for entry in listed if entry.startswith(b"??")]
+    git("update-index", "--add", "--replace", "-z", "--stdin", stdin=b"\0".join(new))
+    tree = git("write-tree", "--missing-ok").decode().strip()
+    entries = git("ls-tree", "-r", "-l", "-z", tree, *ROOTS).split(b"\0")[:-1]
+    _refuse(_why_not_read(*entry.split(b"\t", 1)) for entry in entries)
+    size = sum(int(entry.split(None, 4)[3]) for entry in entries)
+    if size > _MOST_BYTES_IN_ALL or len(entries) > _MOST_FILES:
+        raise StateRepoError(
+            f"{folder} has more than {_MOST_FILES:,} files or {_MOST_BYTES_IN_ALL >> 20} MiB to "
+            "check; take some out"
+        )
+    repo.odb.add_disk_alternate(str(objects))
+    return repo[tree].peel(Tree)
+
+
+def _refuse(reasons: Iterable[tuple[bytes, str]]) -> None:
+    faults = [fault("", text).within(trees.printable(path)) for path, text in reasons if text]
+    if faults:
+        raise InvalidInput(faults)
+
+
+_NESTED = "belongs to another Git repository, whose files are not read; remove it"
+_LARGE = f"has more than {_MOST_BYTES >> 20} MiB; make it smaller"
+
+
+def _why_not_added(folder: Path, mark: bytes, path: bytes) -> tuple[bytes, str]:
+    # some file systems do not tell .GIT from .git
+    if path.endswith(b"/") or b".git" in path.lower().split(b"/"):
+        return path.rstrip(b"/"), _NESTED
+    if mark in _UNMERGED:
+        return path, "is not merged yet; edit it as it shall be, and run `git add`"
+    with suppress(FileNotFoundError, NotADirectoryError):
+        if (folder / os.fsdecode(path)).lstat().st_size > _MOST_BYTES:
+            return path, _LARGE
+    return path, ""
+
+
+def _why_not_read(about: bytes, path: bytes) -> tuple[bytes, str]:
+    mode, _, _, size = about.split()
+    if mode == b"120000":  # it may point to a file that the report must not show
+        return path, "is a symbolic link, which is not followed; replace it by a file"
+    if mode == b"160000":
+        return path, _NESTED
+    if path.count(b"/") > trees.MAX_DEPTH:
+        return path, f"is more than {trees.MAX_DEPTH} folders deep; move it up"
+    return path, _LARGE if int(size) > _MOST_BYTES else ""
+
+
+# ---- the commit that an edit started from ----
+
+_DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
 _SHALLOW = (
     "this clone is shallow and lacks the commit that the edit started from; fetch all commits: "
     "git fetch --unshallow origin (in a pipeline, set fetch-depth: 0 or GIT_DEPTH: 0)"
@@ -163,112 +303,46 @@ class Base:
         return changeset.planned_releases(self.state) if self.state else {}
 
 
-def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
-    """Return the state repo's files as path → text, and a fault for each entry that is not read."""
-    # The author of a pull request may be hostile, so only plain files inside of the folder are
-    # read, and no other code of the check reads the checkout.
-    if not os.path.lexists(folder / "demandops.yaml"):  # is_file follows a link, and may fail
-        if (folder / "HEAD").is_file():
-            raise StateRepoError(
-                f"{folder} is a bare repository, which has no files to edit; clone it, and use the "
-                f"clone: git clone {folder}"
-            )
-        raise StateRepoError(
-            f"{folder} is not a state repo, because it has no demandops.yaml; name a checkout of "
-            "one, or make one with `demandops init`"
-        )
-    files, faults, size = dict[str, str](), list[Fault](), 0
-    waiting = [folder / root for root in reversed(_ROOTS)]
-    while waiting:
-        path = waiting.pop()
-        parts = path.relative_to(folder)
-        name = os.fsencode(parts).decode("utf-8", "backslashreplace")
-        try:
-            status = path.lstat()
-            if message := _why_not_read(path.name, len(parts.parts), status):
-                faults.append(fault("", message).within(name))
-            elif stat.S_ISDIR(status.st_mode):
-                waiting += sorted(path.iterdir(), reverse=True)
-            else:
-                files[name] = path.read_bytes().decode("utf-8", "replace")
-                size += status.st_size
-        except FileNotFoundError:  # one of _ROOTS
-            continue
-        except OSError as error:
-            raise StateRepoError(f"{path} cannot be read: {error.strerror}") from None
-        if size > _MOST_BYTES_IN_ALL or len(files) + len(waiting) > _MOST_FILES:
-            raise StateRepoError(
-                f"{folder} has more than {_MOST_FILES:,} files or {_MOST_BYTES_IN_ALL >> 20} MiB "
-                "to check; take some out"
-            )
-    return files, faults
-
-
-def _why_not_read(name: str, depth: int, status: os.stat_result) -> str:
-    if stat.S_ISLNK(status.st_mode):  # it may point to a file that the report must not show
-        return "is a symbolic link, which is not followed; replace it by a file"
-    if not (stat.S_ISDIR(status.st_mode) or stat.S_ISREG(status.st_mode)):
-        return "is neither a file nor a folder; remove it"
-    if name.lower() == ".git":  # some file systems do not tell .GIT from .git
-        return "belongs to another Git repository, whose files are not read; remove it"
-    if stat.S_ISDIR(status.st_mode):
-        deep = f"is more than {trees.MAX_DEPTH} folders deep; move it up"
-        return deep if depth > trees.MAX_DEPTH else ""
-    large = f"has more than {_MOST_BYTES >> 20} MiB; make it smaller"
-    return large if status.st_size > _MOST_BYTES else ""
-
-
-def base_of(folder: Path, revision: str | None) -> Base | None:
+def base_of(repo: Repository, revision: str | None) -> Base | None:
     # ``revision`` is the merge target; by default ``origin/main``, else ``main``. If there is
-    # neither, the edit is compared with HEAD. None if the folder is no checkout with a commit.
-    try:
-        repo = Repository(str(folder))
-    except pygit2.GitError as error:
-        if reason := unopened(folder, error):
-            raise reason from None
-        if revision is not None:
-            raise StateRepoError(f"{folder} is not a Git checkout; leave out --base") from None
-        return None
-    if "core.sparsecheckout" in repo.config and repo.config.get_bool("core.sparsecheckout"):
-        raise StateRepoError(
-            f"{folder} is a sparse checkout, which lacks files; check out all files with "
-            "`git sparse-checkout disable`"
-        )
+    # neither, the edit is compared with HEAD. None without a commit.
     if repo.is_empty or repo.head_is_unborn:
-        return None
-    with reading(str(folder), repo):
-        target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
-        head = repo.head.peel(Commit)
-        try:
-            tip = revisions.resolve(repo, head.id, target, REAL.now()) if target else None
-            common = repo.merge_base(head.id, tip.id) if tip is not None else None
-        except (StateRepoError, pygit2.GitError, KeyError):
-            if repo.is_shallow:
-                raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
-            raise
-        if common is None and repo.is_shallow:
-            raise StateRepoError(_SHALLOW)
-        if common is None and target:
+        if revision is not None:
             raise StateRepoError(
-                f"HEAD and {target} have no commit in common; name the merge target with --base"
+                "the folder has no commit or is not a Git checkout; leave out --base"
             )
-        commit = head if common is None else trees.commit_of(repo, common)
-        base = Base(str(commit.id), trees.texts(commit.tree, _ROOTS), None, False)
-        if tip is not None:
-            _, newer = repo.ahead_behind(head.id, tip.id)
-            merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
-            name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
-            base = replace(base, target=name, newer=newer, merged=merged)
-        try:
-            snapshot = snapshots.state_at(repo, commit.id)
-        except (InvalidInput, StateRepoError):
-            return base
-        return replace(base, state=snapshot.state, valid=not snapshot.problems)
-
-
-def author_of(folder: Path) -> str:
+        return None
+    target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
+    head = repo.head.peel(Commit)
     try:
-        repo = Repository(str(folder))
+        tip = revisions.resolve(repo, head.id, target, REAL.now()) if target else None
+        common = repo.merge_base(head.id, tip.id) if tip is not None else None
+    except (StateRepoError, pygit2.GitError, KeyError):
+        if repo.is_shallow:
+            raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
+        raise
+    if common is None and repo.is_shallow:
+        raise StateRepoError(_SHALLOW)
+    if common is None and target:
+        raise StateRepoError(
+            f"HEAD and {target} have no commit in common; name the merge target with --base"
+        )
+    commit = head if common is None else trees.commit_of(repo, common)
+    base = Base(str(commit.id), trees.texts(commit.tree, ROOTS), None, False)
+    if tip is not None:
+        _, newer = repo.ahead_behind(head.id, tip.id)
+        merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
+        name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
+        base = replace(base, target=name, newer=newer, merged=merged)
+    try:
+        snapshot = snapshots.state_at(repo, commit.id)
+    except (InvalidInput, StateRepoError):
+        return base
+    return replace(base, state=snapshot.state, valid=not snapshot.problems)
+
+
+def author_of(repo: Repository) -> str:
+    try:
         return str(repo.head.peel(Commit).author.name)
     except (pygit2.GitError, LookupError, ValueError):  # also an encoding that nobody knows
         return ""
