@@ -37,18 +37,16 @@ class LocalRepository(StateRepository):
     def __init__(self, path: Path) -> None:
         self.address = str(path)
         self._lock_seen: tuple[tuple[int, int], float] | None = None
-        try:
-            self.objects = Repository(str(path))
-        except pygit2.GitError as error:
-            if reason := repositories.unopened(path, error):
-                raise reason from None
+        objects = repositories.open_folder(path)
+        if objects is None:
             remedy = f"make one with `demandops init {path} --bare`"
             if any(path.iterdir()):  # `demandops init` would refuse this folder
                 remedy = (
                     "name another folder, or make one in a new folder with `demandops init DIR "
                     "--bare`"
                 )
-            raise StateRepoError(f"{path} is not a Git repository; {remedy}") from None
+            raise StateRepoError(f"{path} is not a Git repository; {remedy}")
+        self.objects = objects
         self.new = NewObjects(self.objects)
         try:
             self._require_usable(path)

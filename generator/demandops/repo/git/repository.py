@@ -17,6 +17,7 @@ from pygit2 import Oid, Repository, Tree
 from demandops.base.errors import StateRepoError, Unsound
 from demandops.base.runtime import REAL, Runtime
 from demandops.base.settings import MAIN_BRANCH
+from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
 from demandops.repo.git.objects import NewObjects
@@ -107,31 +108,29 @@ def lacks_objects(repo: Repository) -> bool:
     return any(entry.name.endswith(filtered) for entry in repo.config)
 
 
-def unopened(folder: Path, error: Exception) -> StateRepoError | None:
-    """Return the error to raise if Git cannot open a folder; None if it is no Git repository."""
-    if not ((folder / ".git").exists() or (folder / "HEAD").is_file()):
-        return _within_another(folder)
-    return StateRepoError(
-        f"{folder} is a Git repository that cannot be opened: {error}; if it belongs to another "
-        f"user, run `git config --global --add safe.directory {folder.resolve()}`"
-    )
-
-
-def _within_another(folder: Path) -> StateRepoError | None:
+def open_folder(folder: Path) -> Repository | None:
+    """Open the Git repository of a folder; None if it has none."""
     try:
-        around = pygit2.discover_repository(str(folder))
-        repo = Repository(around) if around else None
-    except pygit2.GitError:
+        repo = Repository(str(folder))
+    except pygit2.GitError as error:
+        if not ((folder / ".git").exists() or (folder / "HEAD").is_file()):
+            return None
+        raise StateRepoError(
+            f"{folder} is a Git repository that cannot be opened: {error}; if it belongs to "
+            f"another user, run `git config --global --add safe.directory {folder.resolve()}`"
+        ) from None
+    # libgit2 looks for a repository in the folders around it too
+    here, around = folder.resolve(), Path(repo.workdir or repo.path).resolve()
+    if here in (around, Path(repo.path).resolve()) or not here.is_relative_to(around):
+        return repo
+    path = here.relative_to(around)
+    if repo.is_bare or repo.path_is_ignored(f"{path}/"):
         return None
-    if repo is None or not repo.workdir:
-        return None
-    path = folder.resolve().relative_to(Path(repo.workdir).resolve())
-    if repo.path_is_ignored(f"{path}/"):
-        return None
-    return StateRepoError(
-        f"{folder} is a folder of the Git repository {repo.workdir}, but a state repo is a "
-        "repository of its own; make it one, for example with "
-        f"`git subtree split --prefix={path} -b fleet`"
+    if (around / ROOT_FILE).is_file():
+        raise StateRepoError(f"{folder} is a folder of the state repo {around}; name {around}")
+    raise StateRepoError(
+        f"{folder} is a folder of the Git repository {around}, but a state repo is a repository of "
+        f"its own; make it one, for example with `git subtree split --prefix={path} -b fleet`"
     )
 
 

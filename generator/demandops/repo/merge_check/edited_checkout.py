@@ -32,7 +32,7 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
-from demandops.repo.git.repository import PARTIAL, lacks_objects, reading, unopened
+from demandops.repo.git.repository import PARTIAL, lacks_objects, open_folder, reading
 from demandops.repo.history import revisions
 from demandops.repo.load import snapshot as snapshots
 
@@ -164,18 +164,14 @@ def opened(folder: Path) -> Iterator[tuple[Repository, Tree]]:
     Files without Git are in an empty repository meanwhile.
     """
     with TemporaryDirectory(prefix="demandops-check-") as scratch:
-        try:
-            repo = Repository(str(folder))
-        except pygit2.GitError as error:
-            if reason := unopened(folder, error):
-                raise reason from None
+        repo = open_folder(folder)
+        if repo is not None and repo.is_bare:
+            raise StateRepoError(
+                f"{folder} is a bare repository, which has no files to edit; clone it, and use the "
+                f"clone: git clone {folder}"
+            )
+        if repo is None:
             repo = pygit2.init_repository(f"{scratch}/empty.git", bare=True)
-        else:
-            if repo.is_bare:
-                raise StateRepoError(
-                    f"{folder} is a bare repository, which has no files to edit; clone it, and use "
-                    f"the clone: git clone {folder}"
-                )
         with reading(str(folder), repo):
             tree = _written_tree(folder, repo, Path(scratch))
             if ROOT_FILE not in tree:
