@@ -188,7 +188,8 @@ BROKEN = "kind: ["
 
 
 def ignore(branch: Path) -> None:
-    (branch / ".gitignore").write_text("overrides/mine.yaml\n")
+    (branch / ".gitignore").write_text("overrides/mine.yaml\n.venv\n")
+    (branch / ".venv").mkdir()
     (branch / "overrides" / "mine.yaml").write_text(BROKEN)
 
 

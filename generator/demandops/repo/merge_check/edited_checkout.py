@@ -6,8 +6,8 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -146,15 +146,11 @@ def _merge_patch(
 
 ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 # A fleet of 20,000 nodes has fewer; more would fill the memory of the machine that checks.
-_MOST_BYTES = 16 << 20
-_MOST_BYTES_IN_ALL = 1 << 30
+_LARGEST, _MOST = 16 << 20, 1 << 30  # bytes of a file, and of all
 _MOST_FILES = 500_000
 _MOST_SECONDS = 600
-_UNMERGED = (b"DD", b"AU", b"UD", b"UA", b"DU", b"AA", b"UU")  # as `git status` marks them
-_NO_CODE = (
-    *("-c", "core.fsmonitor=false", "-c", f"core.hooksPath={os.devnull}"),
-    *("-c", "core.splitIndex=false"),  # or git would write into the checkout's repository
-)
+_NO_PROGRAMS = ("-c", "core.fsmonitor=false", "-c", f"core.hooksPath={os.devnull}")
+_NO_SPLIT = ("-c", "core.splitIndex=false")  # or git would write into the checkout's repository
 
 
 @contextmanager
@@ -183,27 +179,19 @@ def opened(folder: Path) -> Iterator[tuple[Repository, Tree]]:
 
 
 def _written_tree(folder: Path, repo: Repository, scratch: Path) -> Tree:
-    own, shared, objects = Path(repo.path), Path(repo.path, "commondir"), scratch / "objects"
-    if shared.is_file():  # of a linked work tree
-        shared = own / shared.read_text().strip()
-    store = (shared if shared.is_dir() else own).resolve() / "objects"
-    (objects / "info").mkdir(parents=True)
-    (objects / "info" / "alternates").write_text(f"{store}\n")
-    if (own / "index").is_file():
-        # with its time, after which git reads files again whose size and time are as before
-        shutil.copy2(own / "index", scratch / "index")
+    index, objects = scratch / "index", scratch / "objects"
+    environment = {
+        "GIT_DIR": repo.path,
+        "GIT_WORK_TREE": str(folder.resolve()),
+        "GIT_INDEX_FILE": str(index),
+        "GIT_OBJECT_DIRECTORY": str(objects),
+        # a partial clone must not fetch; before Git 2.44 only the latter prevents that
+        **{"GIT_NO_LAZY_FETCH": "1", "GIT_ALLOW_PROTOCOL": "none"},
+    }
 
-    def git(*arguments: str, stdin: bytes = b"") -> bytes:
-        environment = {
-            "GIT_DIR": str(own),
-            "GIT_WORK_TREE": str(folder.resolve()),
-            "GIT_INDEX_FILE": str(scratch / "index"),
-            "GIT_OBJECT_DIRECTORY": str(objects),
-            # a partial clone must not fetch; before Git 2.44 only the latter prevents that
-            **{"GIT_NO_LAZY_FETCH": "1", "GIT_ALLOW_PROTOCOL": "none"},
-        }
+    def git(*arguments: str, stdin: bytes = b"") -> list[bytes]:
         done = subprocess.run(
-            ["git", "--literal-pathspecs", *_NO_CODE, *arguments],
+            ["git", *_NO_PROGRAMS, *_NO_SPLIT, *arguments],
             cwd=folder,
             env=os.environ | child_processes.mark() | environment,
             input=stdin,
@@ -216,62 +204,55 @@ def _written_tree(folder: Path, repo: Repository, scratch: Path) -> Tree:
         if done.returncode:
             told = done.stderr.decode(errors="replace").strip().splitlines()
             raise StateRepoError(
-                f"{folder} cannot be read as git would commit it: {(told or ['git failed'])[-1]}; "
-                "mend it until `git add --all` succeeds"
+                f"{folder} cannot be read as git would commit it: {'; '.join(told)}; mend it until "
+                "`git add --all` succeeds"
             )
-        return done.stdout
+        return [part for part in done.stdout.removesuffix(b"\n").split(b"\0") if part]
 
-    status = ("status", "--porcelain", "-z", "--no-renames", "--ignore-submodules=dirty")
-    listed = git(*status, "--untracked-files=all", "--", *ROOTS).split(b"\0")[:-1]
-    # git must not read what is refused afterwards
-    _refuse(_why_not_added(folder, entry[:2], entry[3:]) for entry in listed)
+    (objects / "info").mkdir(parents=True)
+    (common,) = git("rev-parse", "--git-common-dir")
+    store = Path(folder, os.fsdecode(common), "objects").resolve()
+    (objects / "info" / "alternates").write_text(f"{store}\n")
+    if (own := Path(repo.path, "index")).is_file():
+        # with its time, after which git reads files again whose size and time are as before
+        shutil.copy2(own, index)
+    unmerged = {entry.partition(b"\t")[2] for entry in git("ls-files", "--unmerged", "-z")}
+    _refuse(dict.fromkeys(unmerged, "is not merged yet; edit it as it shall be, and `git add` it"))
+    new = git("ls-files", "--others", "--exclude-standard", "-z", "--", *ROOTS)
+    _refuse({path.rstrip(b"/"): _NESTED for path in new if path.endswith(b"/")})
     git("add", "--update")
-    new = [entry[3:] for entry in listed if entry.startswith(b"??")]
     git("update-index", "--add", "--replace", "-z", "--stdin", stdin=b"\0".join(new))
-    tree = git("write-tree", "--missing-ok").decode().strip()
-    entries = git("ls-tree", "-r", "-l", "-z", tree, *ROOTS).split(b"\0")[:-1]
-    _refuse(_why_not_read(*entry.split(b"\t", 1)) for entry in entries)
-    size = sum(int(entry.split(None, 4)[3]) for entry in entries)
-    if size > _MOST_BYTES_IN_ALL or len(entries) > _MOST_FILES:
+    (tree,) = git("write-tree", "--missing-ok")
+    entries = git("ls-tree", "-r", "-l", "-z", tree.decode(), *ROOTS)
+    listed = [entry.partition(b"\t") for entry in entries]
+    _refuse({path: _why_not_read(about, path) for about, _, path in listed})
+    if len(listed) > _MOST_FILES or sum(int(about.split()[3]) for about, _, _ in listed) > _MOST:
         raise StateRepoError(
-            f"{folder} has more than {_MOST_FILES:,} files or {_MOST_BYTES_IN_ALL >> 20} MiB to "
-            "check; take some out"
+            f"{folder} has more than {_MOST_FILES:,} files or {_MOST >> 20} MiB to check; take "
+            "some out"
         )
     repo.odb.add_disk_alternate(str(objects))
-    return repo[tree].peel(Tree)
+    return repo[tree.decode()].peel(Tree)
 
 
-def _refuse(reasons: Iterable[tuple[bytes, str]]) -> None:
-    faults = [fault("", text).within(trees.printable(path)) for path, text in reasons if text]
+_NESTED = "belongs to another Git repository, whose files are not read; remove it"
+
+
+def _refuse(reasons: Mapping[bytes, str]) -> None:
+    faults = [fault("", why).within(trees.printable(path)) for path, why in reasons.items() if why]
     if faults:
         raise InvalidInput(faults)
 
 
-_NESTED = "belongs to another Git repository, whose files are not read; remove it"
-_LARGE = f"has more than {_MOST_BYTES >> 20} MiB; make it smaller"
-
-
-def _why_not_added(folder: Path, mark: bytes, path: bytes) -> tuple[bytes, str]:
-    # some file systems do not tell .GIT from .git
-    if path.endswith(b"/") or b".git" in path.lower().split(b"/"):
-        return path.rstrip(b"/"), _NESTED
-    if mark in _UNMERGED:
-        return path, "is not merged yet; edit it as it shall be, and run `git add`"
-    with suppress(FileNotFoundError, NotADirectoryError):
-        if (folder / os.fsdecode(path)).lstat().st_size > _MOST_BYTES:
-            return path, _LARGE
-    return path, ""
-
-
-def _why_not_read(about: bytes, path: bytes) -> tuple[bytes, str]:
+def _why_not_read(about: bytes, path: bytes) -> str:
     mode, _, _, size = about.split()
     if mode == b"120000":  # it may point to a file that the report must not show
-        return path, "is a symbolic link, which is not followed; replace it by a file"
+        return "is a symbolic link, which is not followed; replace it by a file"
     if mode == b"160000":
-        return path, _NESTED
+        return _NESTED
     if path.count(b"/") > trees.MAX_DEPTH:
-        return path, f"is more than {trees.MAX_DEPTH} folders deep; move it up"
-    return path, _LARGE if int(size) > _MOST_BYTES else ""
+        return f"is more than {trees.MAX_DEPTH} folders deep; move it up"
+    return f"has more than {_LARGEST >> 20} MiB; make it smaller" if int(size) > _LARGEST else ""
 
 
 # ---- the commit that an edit started from ----
