@@ -209,9 +209,10 @@ def _written_tree(folder: Path, repo: Repository, scratch: Path) -> Tree:
             )
         return [part for part in done.stdout.removesuffix(b"\n").split(b"\0") if part]
 
+    shared = Path(repo.path, "commondir")  # of a linked work tree
+    common = shared.read_text().strip() if shared.is_file() else ""
     (objects / "info").mkdir(parents=True)
-    (common,) = git("rev-parse", "--git-common-dir")
-    store = Path(folder, os.fsdecode(common), "objects").resolve()
+    store = Path(repo.path, common, "objects").resolve()
     (objects / "info" / "alternates").write_text(f"{store}\n")
     if (own := Path(repo.path, "index")).is_file():
         # with its time, after which git reads files again whose size and time are as before
