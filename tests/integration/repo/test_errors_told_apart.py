@@ -325,7 +325,7 @@ def test_a_repo_of_this_disk_that_lost_a_file_is_told_with_the_remedy(
     bare: Path, tmp_path: Path, demandops: Run, path: str
 ) -> None:
     lost = lose(bare, tmp_path, f"main:{path}")
-    with pytest.raises(StateRepoError, match=f"{lost}.*restore it from a backup"):
+    with pytest.raises(StateRepoError, match=f"{lost}.*restore them from a backup"):
         Generator(str(bare))
     told = demandops("bookkeeping", "--state-repo", bare)
     assert told.code == 1

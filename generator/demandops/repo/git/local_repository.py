@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import re
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,33 +51,7 @@ class LocalRepository(StateRepository):
             self._require_usable(path)
             _ = self.objects[self.tip()].peel(pygit2.Commit).tree
         except (pygit2.GitError, KeyError, OSError) as error:
-            raise repositories.disk_error(error, self.address) or self._unreadable(
-                str(error)
-            ) from None
-
-    def _unreadable(self, what: str) -> StateRepoError:
-        return StateRepoError(
-            f"{self.address} cannot be read: {what}; check its disk, and if "
-            f"`git -C {self.address} fsck` finds it broken, restore it from a backup or a clone"
-        )
-
-    def renew_if_damaged(self) -> bool:
-        """Raise StateRepoError if git finds damage: there is no remote to clone from."""
-        checked = subprocess.run(
-            ["git", "fsck", "--no-dangling", "--no-progress"],
-            cwd=self.objects.path,
-            env=os.environ | repositories.git_environment(),
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-        )
-        if checked.returncode:
-            lines = [*(checked.stderr + checked.stdout).strip().splitlines(), "git fsck fails"]
-            # other lines name only objects that point to the missing one
-            missing = (line for line in lines if line.startswith("missing "))
-            raise self._unreadable(next(missing, lines[0]))
-        return False
+            raise repositories.access_error(error, self.address, self.objects) from None
 
     def _require_usable(self, path: Path) -> None:
         borrowed = Path(self.objects.path) / "objects" / "info" / "alternates"
@@ -99,8 +72,6 @@ class LocalRepository(StateRepository):
                 f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
                 f"use a bare clone: git clone --bare {path} {path}.git"
             )
-        if self.tip() not in self.objects:
-            raise self._unreadable(f"its commit {self.tip()} is missing")
 
     def tip(self) -> Oid:
         main = self.objects.references.get(self.main_reference)
@@ -194,11 +165,11 @@ _SETTINGS = re.compile(
 def needs_push(address: str) -> bool:
     """Return whether a folder has a repository with hooks or settings that only git obeys."""
     try:
-        repo = Repository(str(Path(address).expanduser()))
-    except (pygit2.GitError, RuntimeError, ValueError):
+        repo = Repository(os.path.expanduser(address))  # noqa: PTH111 - the other one raises errors
+        settings = {entry.name.lower(): entry.value or "" for entry in repo.config}
+    except (pygit2.GitError, ValueError):
         return False
-    settings = {entry.name.lower(): entry.value or "" for entry in repo.config}
-    hooks = Path(repo.path, Path(settings.get("core.hookspath", "hooks")).expanduser())
+    hooks = Path(repo.path, os.path.expanduser(settings.get("core.hookspath", "hooks")))  # noqa: PTH111
     return any(map(_SETTINGS.fullmatch, settings)) or any(
         (hooks / name).is_file() and os.access(hooks / name, os.X_OK) for name in _HOOKS
     )

@@ -140,9 +140,8 @@ def access_error(error: Exception, address: str, objects: Repository | None = No
     is_missing = isinstance(error, KeyError) and isinstance(error.args[0], Oid)
     if not (is_missing or isinstance(error, OSError | pygit2.GitError)):
         return error
-    # the text of a KeyError would have quotes
-    what = str(error.args[0]) if isinstance(error, KeyError) else str(error)
-    if objects is not None and lacks_objects(objects):
+    what = f"Git object {error.args[0]} is missing" if is_missing else str(error)
+    if objects is not None and not isinstance(error, OSError) and lacks_objects(objects):
         return StateRepoError(PARTIAL.format(address))
     if objects is not None and (oid := re.search("[0-9a-f]{40}", what)):
         place = trees.place_of(Repository(objects.path), Oid(hex=oid[0]))
@@ -240,9 +239,9 @@ class StateRepository(ABC):
         except StateRepoError:
             return None
 
-    @abstractmethod
     def renew_if_damaged(self) -> bool:
-        """Let git check the files, and replace a damaged clone; return whether it was replaced."""
+        """Let git check a clone, and replace a damaged one; return whether it was replaced."""
+        return False
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End the running transfer with a remote, if any; later ones raise RemoteAway."""

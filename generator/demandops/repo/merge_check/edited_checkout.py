@@ -32,7 +32,7 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
-from demandops.repo.git.repository import PARTIAL, lacks_objects, open_folder, reading
+from demandops.repo.git.repository import PARTIAL, open_folder, reading
 from demandops.repo.history import revisions
 from demandops.repo.load import snapshot as snapshots
 
@@ -148,7 +148,6 @@ ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 # A fleet of 20,000 nodes has fewer; more would fill the memory of the machine that checks.
 _LARGEST, _MOST = 16 << 20, 1 << 30  # bytes of a file, and of all
 _MOST_FILES = 500_000
-_MOST_SECONDS = 600
 _NO_PROGRAMS = ("-c", "core.fsmonitor=false", "-c", f"core.hooksPath={os.devnull}")
 _NO_SPLIT = ("-c", "core.splitIndex=false")  # or git would write into the checkout's repository
 
@@ -186,7 +185,7 @@ def _written_tree(folder: Path, repo: Repository, scratch: Path) -> Tree:
         "GIT_INDEX_FILE": str(index),
         "GIT_OBJECT_DIRECTORY": str(objects),
         # a partial clone must not fetch; before Git 2.44 only the latter prevents that
-        **{"GIT_NO_LAZY_FETCH": "1", "GIT_ALLOW_PROTOCOL": "none"},
+        **{"GIT_NO_LAZY_FETCH": "1", "GIT_ALLOW_PROTOCOL": "none", "LC_ALL": "C"},
     }
 
     def git(*arguments: str, stdin: bytes = b"") -> list[bytes]:
@@ -197,9 +196,8 @@ def _written_tree(folder: Path, repo: Repository, scratch: Path) -> Tree:
             input=stdin,
             capture_output=True,
             check=False,
-            timeout=_MOST_SECONDS,
         )
-        if done.returncode and lacks_objects(repo):
+        if done.returncode and b"promisor" in done.stderr:
             raise StateRepoError(PARTIAL.format(folder))
         if done.returncode:
             told = done.stderr.decode(errors="replace").strip().splitlines()
