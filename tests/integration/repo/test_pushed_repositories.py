@@ -76,6 +76,16 @@ def test_what_people_push_meanwhile_is_carried_out(bare: Path, person: Person) -
     rig.assert_sound(bare)
 
 
+def test_demands_wait_while_the_folder_is_away(bare: Path) -> None:
+    rig.hook(bare, "post-receive", "true")
+    with rig.running(bare, fetch_interval=0.1) as generator:
+        with rig.away(bare):
+            ticket = generator.submit(rig.goal(1))
+            rig.wait_until(lambda: generator.remote_status.unreachable, "told")
+            assert not ticket.future.done()
+        assert rig.receipt(ticket).outcome == "booked"
+
+
 def test_a_hook_that_comes_while_a_generator_runs_is_not_passed_by(bare: Path) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, rig.goal(1))

@@ -6,6 +6,7 @@ import logging
 import os
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pygit2
@@ -183,9 +184,11 @@ class PushedRepository(RemoteRepository):
         super().__init__(str(Path(place.objects.path).resolve()), folder, notify, False)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        # to look is cheap, to fetch is not
-        is_new = self._place.tip() != self.tip()
-        return super().refresh(urgent) if is_new else self.tip()
+        # to look is cheap, to fetch is not; git says why the repository cannot be read
+        with suppress(pygit2.GitError, KeyError, OSError, StateRepoError):
+            if self._place.tip() == self.tip():
+                return self.tip()
+        return super().refresh(urgent)
 
     def tidy(self) -> None:
         super().tidy()
