@@ -159,7 +159,7 @@ _HOOKS = ("pre-receive", "update", "post-receive", "post-update", "reference-tra
 # What a push may do, and who may read what it writes. The objects that this program makes would
 # pass git's check of objects, and it always keeps them packed.
 _SETTINGS = re.compile(
-    r"core\.sharedrepository|hook\..*|(receive|transfer)\.(?!fsckobjects$|unpacklimit$).*"
+    r"core\.sharedrepository|transfer\.hiderefs|hook\..*|receive\.(?!fsckobjects$|unpacklimit$).*"
 )
 
 
