@@ -39,13 +39,10 @@ class LocalRepository(StateRepository):
         self._lock_seen: tuple[tuple[int, int], float] | None = None
         objects = repositories.open_folder(path)
         if objects is None:
-            remedy = f"make one with `demandops init {path} --bare`"
-            if any(path.iterdir()):  # `demandops init` would refuse this folder
-                remedy = (
-                    "name another folder, or make one in a new folder with `demandops init DIR "
-                    "--bare`"
-                )
-            raise StateRepoError(f"{path} is not a Git repository; {remedy}")
+            raise StateRepoError(
+                f"{path} is not a Git repository; name another folder, or make one in a new folder "
+                "with `demandops init DIR --bare`"
+            )
         self.objects = objects
         self.new = NewObjects(self.objects)
         try:
