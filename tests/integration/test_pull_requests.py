@@ -180,6 +180,157 @@ def test_the_check_of_another_render_version_says_so(
     assert told.startswith("error: demandops.yaml:15: renderVersion: is 3, but this program ")
 
 
+# ---- what Git would commit ----
+
+NODES = "inventory/nodes.yaml"
+BROKEN = "kind: ["
+
+
+def ignore(branch: Path) -> None:
+    (branch / ".gitignore").write_text("overrides/mine.yaml\n.venv\n")
+    (branch / ".venv").mkdir()
+    (branch / "overrides" / "mine.yaml").write_text(BROKEN)
+
+
+def ignore_a_tracked_file(branch: Path) -> None:
+    (branch / ".gitignore").write_text("inventory/\n")
+    (branch / NODES).write_text(BROKEN)
+
+
+def convert_line_ends(branch: Path) -> None:
+    git(branch, "config", "core.autocrlf", "true")
+    for file in branch.glob("[!.]*/**/*.yaml"):
+        file.write_bytes(file.read_bytes().replace(b"\n", b"\r\n"))
+
+
+def encrypt(branch: Path) -> None:
+    git(branch, "config", "filter.box.clean", "tr a-z b-za")
+    (branch / ".gitattributes").write_text("inventory/nodes.yaml filter=box\n")
+    git(branch, "add", "--renormalize", NODES)
+
+
+def miss_a_filter(branch: Path) -> None:
+    git(branch, "config", "filter.box.clean", "no-such-program")
+    git(branch, "config", "filter.box.required", "true")
+    (branch / ".gitattributes").write_text("inventory/nodes.yaml filter=box\n")
+    (branch / NODES).touch()
+
+
+def hide(branch: Path, mark: str) -> None:
+    git(branch, "update-index", mark, NODES)
+    (branch / NODES).write_text(BROKEN)
+
+
+def intend_to_add(branch: Path) -> None:
+    (branch / "overrides" / "new.yaml").write_text(BROKEN)
+    git(branch, "add", "--intent-to-add", "overrides/new.yaml")
+
+
+def edit_a_part(branch: Path) -> None:
+    git(branch, "sparse-checkout", "set", "--sparse-index", "registry")
+    (branch / "registry" / "images.yaml").write_text(BROKEN)
+
+
+def conflict(branch: Path) -> None:
+    for name, tag in (("edit", "2025-09"), ("other", "2025-10")):
+        git(branch, "checkout", "-q", "-B", name, "main")
+        edit(branch / "registry" / "images.yaml", ("tag: 2025-04", f"tag: {tag}"))
+        commit(branch)
+    git(branch, "merge", "-q", "edit", check=False)
+
+
+def link_a_folder(branch: Path) -> None:
+    shutil.rmtree(branch / "overrides")
+    (branch / "overrides").symlink_to("inventory")
+
+
+def encode(branch: Path) -> None:
+    (branch / ".gitattributes").write_text("*/nodes.yaml text working-tree-encoding=UTF-16\n")
+    (branch / NODES).write_bytes((branch / NODES).read_text().encode("utf-16"))
+
+
+@pytest.mark.parametrize(
+    ("lay", "told"),
+    [
+        (ignore, ""),
+        (ignore_a_tracked_file, f"error: {NODES}: line 2, column 1: not valid YAML"),
+        (convert_line_ends, ""),
+        (encrypt, f"error: {NODES}: apiVersion: is missing"),
+        (miss_a_filter, f"{NODES}: clean filter 'box' failed; mend it until `git add --all` "),
+        (lambda branch: hide(branch, "--assume-unchanged"), ""),
+        (lambda branch: hide(branch, "--skip-worktree"), ""),
+        (intend_to_add, "error: overrides/new.yaml: line 2, column 1: not valid YAML"),
+        (edit_a_part, "error: registry/images.yaml: line 2, column 1: not valid YAML"),
+        (conflict, "error: registry/images.yaml: is not merged yet; edit it"),
+        (link_a_folder, "error: overrides: is a symbolic link"),
+        (encode, ""),
+    ],
+)  # fmt: skip
+def test_what_git_would_commit_counts(
+    branch: Path, check: Run, lay: Callable[[Path], None], told: str
+) -> None:
+    lay(branch)
+    ran = check()
+    assert ran.code == bool(told)
+    assert told in ran.err
+
+
+def test_git_runs_no_program_of_the_checkout_and_writes_nothing_into_it(
+    branch: Path, check: Run
+) -> None:
+    (branch / "touch.sh").write_text("#!/bin/sh\ntouch ran\n")
+    (branch / "touch.sh").chmod(0o755)
+    git(branch, "update-index", "--split-index")
+    git(branch, "config", "core.splitIndex", "true")
+    git(branch, "config", "core.fsmonitor", str(branch / "touch.sh"))
+    git(branch, "config", "core.hooksPath", "hooks")
+    (branch / "hooks").mkdir()
+    (branch / "touch.sh").rename(branch / "hooks" / "post-index-change")
+    newer_images(branch)
+    before = {path: path.read_bytes() for path in branch.rglob("*") if path.is_file()}
+    assert check().code == 0
+    assert {path: path.read_bytes() for path in branch.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.parametrize("kind", ["tree:0", "blob:none"])
+def test_a_partial_clone_is_told_how_to_become_whole(
+    bare: Path, tmp_path: Path, demandops: Run, kind: str
+) -> None:
+    git(bare, "config", "uploadpack.allowFilter", "true")
+    folder, edited = tmp_path / "partial", "registry/images.yaml"
+    book(bare, 2)
+    git(tmp_path, "clone", "-q", f"--filter={kind}", bare.as_uri(), str(folder))
+    (folder / edited).write_text(BROKEN)
+    for command in (["check", folder, "--base", "main~1"], ["diff", "main~1", "main"]):
+        ran = demandops(*command, *([] if "check" in command else ["--state-repo", folder]))
+        assert (ran.code, ran.out) == (1, "")
+        _, _, remedy = ran.err.rstrip().partition("lacks objects; fetch them: git -C ")
+        assert remedy == f"{folder} fetch --refetch --no-filter origin"
+    git(folder, "fetch", "-q", "--refetch", "--no-filter", "origin")
+    ran = demandops("check", folder, "--base", "main~1")
+    assert ran.err.splitlines()[-1].startswith(f"error: {edited}: line 2, column 1: not valid YAML")
+
+
+def test_a_linked_work_tree_is_a_checkout(branch: Path, tmp_path: Path, demandops: Run) -> None:
+    git(branch, "worktree", "add", "-q", str(tmp_path / "linked"), "-b", "more")
+    newer_images(tmp_path / "linked")
+    assert "what merging would do" in demandops("check", tmp_path / "linked").out
+
+
+def test_a_fleet_in_a_folder_of_another_repository_is_refused(
+    branch: Path, tmp_path: Path, demandops: Run
+) -> None:
+    whole = tmp_path / "whole"
+    git(tmp_path, "init", "-q", str(whole))
+    shutil.copytree(branch, whole / "fleet", ignore=shutil.ignore_patterns(".git"))
+    for command in (["check"], ["get", "nodes", "--state-repo"], ["log", "--state-repo"]):
+        ran = demandops(*command, whole / "fleet")
+        assert (ran.code, ran.out) == (1, "")
+        told = f"error: {whole}/fleet is a folder of the Git repository {whole}, but a state repo "
+        assert ran.err.startswith(told)
+    assert f"name {branch}\n" in demandops("check", branch / "inventory").err
+
+
 # ---- branches ----
 
 

@@ -21,7 +21,7 @@ from demandops.model.config.config import Config
 from demandops.model.demand.demand import Rollback
 from demandops.repo import verification
 from demandops.repo.git import tree as trees
-from demandops.repo.git.local_repository import LastFetch, connect, is_url
+from demandops.repo.git.local_repository import LastFetch, connect, is_url, needs_push
 from demandops.repo.git.repository import StateRepository, access_error, reading
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
@@ -44,7 +44,8 @@ class Reader:
         try:
             # The clone of a URL stays on the disk for later readers. It is in a folder of readers,
             # so that none takes over a generator's journal.
-            slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
+            is_cloned = is_url(address) or (not only_read and needs_push(address))
+            slot = Slot(settings.data_home(address) / "reader") if is_cloned else None
         except OSError as error:
             raise access_error(error, f"the data folder of {address}") from None
         try:

@@ -140,7 +140,7 @@ class Worker:
         self._runtime = repository.runtime
         self._heartbeat = repository.while_waiting = heartbeat
         self._rate_limit = RateLimit()
-        self._agenda = Agenda(fetch_interval, self._runtime, local=repository.always_current)
+        self._agenda = Agenda(fetch_interval, self._runtime, local=repository.on_this_disk)
         self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
         self._backoff = Backoff(self._batch_limit, self._runtime)
         self._must_fetch = self._tip_is_fresh = False

@@ -325,7 +325,7 @@ def test_a_repo_of_this_disk_that_lost_a_file_is_told_with_the_remedy(
     bare: Path, tmp_path: Path, demandops: Run, path: str
 ) -> None:
     lost = lose(bare, tmp_path, f"main:{path}")
-    with pytest.raises(StateRepoError, match=f"{lost}.*restore it from a backup"):
+    with pytest.raises(StateRepoError, match=f"{lost}.*restore them from a backup"):
         Generator(str(bare))
     told = demandops("bookkeeping", "--state-repo", bare)
     assert told.code == 1
@@ -353,6 +353,8 @@ def test_a_checkout_that_lacks_a_file_is_told_by_check(
     folder = tmp_path / "checkout"
     rig.git(tmp_path, "clone", "--quiet", "--no-local", str(bare), str(folder))
     lost = lose(folder / ".git", tmp_path, "HEAD:demandops.yaml")
+    with (folder / "demandops.yaml").open("a") as file:
+        file.write("# git would store the lost content again\n")
     told = demandops("check", folder)
     assert told.code == 1
     assert f"demandops.yaml of commit {rig.git(folder, 'rev-parse', 'HEAD')[:10]}" in told.err

@@ -90,7 +90,7 @@ def test_a_repo_that_borrows_objects_is_refused(bare: Path, tmp_path: Path) -> N
     [
         ("", "corrupted loose reference file"),
         ("x" * 40 + "\n", "corrupted loose reference file"),
-        ("1" * 40 + "\n", f"its commit {'1' * 40} is missing"),
+        ("1" * 40 + "\n", f"Git object {'1' * 40} is missing"),
     ],
 )
 def test_a_branch_that_cannot_be_read_is_told_with_the_remedy(
@@ -99,6 +99,6 @@ def test_a_branch_that_cannot_be_read_is_told_with_the_remedy(
     branch = bare / "refs/heads/main"
     branch.parent.mkdir(exist_ok=True)
     branch.write_text(text)
-    remedy = f"{what}.*; check its disk, .* restore it from a backup or a clone"
+    remedy = f"{what}.*; check its disk .* restore them from a backup"
     with pytest.raises(StateRepoError, match=remedy):
         LocalRepository(bare)

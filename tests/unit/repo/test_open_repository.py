@@ -93,7 +93,6 @@ Make = Callable[[Path], object]
 NO_REPO: dict[str, Make] = {
     "does not exist; correct the path, or make a state repo there with `demandops init {} --bare`":
         lambda path: None,
-    "is not a Git repository; make one with `demandops init {} --bare`": Path.mkdir,
     "is not a Git repository; name another folder, or make one in a new folder":
         lambda path: (path / "mine").mkdir(parents=True),
     "is not a folder; name the folder of a state repo": Path.touch,

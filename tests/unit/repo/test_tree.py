@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import gc
 import os
-import subprocess
 import tempfile
 import weakref
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,7 +14,7 @@ from pathlib import Path
 import pygit2
 import pytest
 from demandops.repo.git import tree as trees
-from demandops.repo.git.objects import NewObjects, Packed, index_of
+from demandops.repo.git.objects import NewObjects
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -201,17 +200,3 @@ def test_a_repo_that_nobody_holds_is_closed(tmp_path: Path) -> None:
     del repo, new
     gc.collect()
     assert seen() is None
-
-
-def test_git_reads_an_index_whose_offsets_need_more_than_31_bits(tmp_path: Path) -> None:
-    offsets = [12, 2**31 - 1, 2**31, 2**40]
-    packed = [Packed(bytes([place]) * 20, 7 * place, one) for place, one in enumerate(offsets)]
-    index = tmp_path / "x.idx"
-    index.write_bytes(index_of(reversed(packed), b"\0" * 20))
-    with index.open("rb") as file:
-        shown = subprocess.run(
-            ["git", "show-index"], check=True, stdin=file, capture_output=True, text=True
-        )
-    assert shown.stdout.splitlines() == [
-        f"{one.offset} {one.oid.hex()} ({one.crc:08x})" for one in packed
-    ]

@@ -23,6 +23,7 @@ from demandops.model.config.load import load
 from demandops.model.config.registry import Image
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo import new_repo
+from demandops.repo.git import tree as trees
 from demandops.repo.merge_check import edited_checkout
 from demandops.templating.evaluator import EVALUATE
 
@@ -319,10 +320,8 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
 
 def _read_configuration(directory: Path) -> tuple[Files, Config]:
     with busy("reading the state repo"):
-        files, faults = edited_checkout.files_of(directory)
-        if faults:
-            raise InvalidInput(faults)
-        people = {path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS}
+        with edited_checkout.opened(directory) as (_, tree):
+            people = trees.texts(tree, CONFIG_ROOTS)
         return people, load(people)
 
 

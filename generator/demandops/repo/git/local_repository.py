@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import re
-import subprocess
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pygit2
@@ -33,55 +33,24 @@ log = logging.getLogger("demandops")
 class LocalRepository(StateRepository):
     """A repository on this disk, written in place and fsynced; nobody may have main checked out."""
 
-    always_current = True
+    always_current = on_this_disk = True
 
     def __init__(self, path: Path) -> None:
         self.address = str(path)
         self._lock_seen: tuple[tuple[int, int], float] | None = None
-        try:
-            self.objects = Repository(str(path))
-        except pygit2.GitError as error:
-            if reason := repositories.unopened(path, error):
-                raise reason from None
-            remedy = f"make one with `demandops init {path} --bare`"
-            if any(path.iterdir()):  # `demandops init` would refuse this folder
-                remedy = (
-                    "name another folder, or make one in a new folder with `demandops init DIR "
-                    "--bare`"
-                )
-            raise StateRepoError(f"{path} is not a Git repository; {remedy}") from None
+        objects = repositories.open_folder(path)
+        if objects is None:
+            raise StateRepoError(
+                f"{path} is not a Git repository; name another folder, or make one in a new folder "
+                "with `demandops init DIR --bare`"
+            )
+        self.objects = objects
         self.new = NewObjects(self.objects)
         try:
             self._require_usable(path)
             _ = self.objects[self.tip()].peel(pygit2.Commit).tree
         except (pygit2.GitError, KeyError, OSError) as error:
-            raise repositories.disk_error(error, self.address) or self._unreadable(
-                str(error)
-            ) from None
-
-    def _unreadable(self, what: str) -> StateRepoError:
-        return StateRepoError(
-            f"{self.address} cannot be read: {what}; check its disk, and if "
-            f"`git -C {self.address} fsck` finds it broken, restore it from a backup or a clone"
-        )
-
-    def renew_if_damaged(self) -> bool:
-        """Raise StateRepoError if git finds damage: there is no remote to clone from."""
-        checked = subprocess.run(
-            ["git", "fsck", "--no-dangling", "--no-progress"],
-            cwd=self.objects.path,
-            env=os.environ | repositories.git_environment(),
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-        )
-        if checked.returncode:
-            lines = [*(checked.stderr + checked.stdout).strip().splitlines(), "git fsck fails"]
-            # other lines name only objects that point to the missing one
-            missing = (line for line in lines if line.startswith("missing "))
-            raise self._unreadable(next(missing, lines[0]))
-        return False
+            raise repositories.access_error(error, self.address, self.objects) from None
 
     def _require_usable(self, path: Path) -> None:
         borrowed = Path(self.objects.path) / "objects" / "info" / "alternates"
@@ -92,10 +61,7 @@ class LocalRepository(StateRepository):
             )
         self.new.clean()
         self.tip()
-        # what `git clone --filter` writes into the configuration
-        filtered = (".promisor", ".partialclonefilter")
-        is_partial = any(entry.name.endswith(filtered) for entry in self.objects.config)
-        if self.objects.is_shallow or is_partial:
+        if self.objects.is_shallow or repositories.lacks_objects(self.objects):
             raise StateRepoError(
                 f"{path} is a clone that lacks a part of the history or of the files; clone the "
                 "state repo again, without --depth and --filter"
@@ -105,8 +71,6 @@ class LocalRepository(StateRepository):
                 f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
                 f"use a bare clone: git clone --bare {path} {path}.git"
             )
-        if self.tip() not in self.objects:
-            raise self._unreadable(f"its commit {self.tip()} is missing")
 
     def tip(self) -> Oid:
         main = self.objects.references.get(self.main_reference)
@@ -126,6 +90,11 @@ class LocalRepository(StateRepository):
     def publish(self, expected: Oid, commit: Oid) -> bool:
         if self.tip() != expected:
             return False
+        if needs_push(self.objects.path):
+            raise Unavailable(
+                f"{self.address} got hooks or settings that only `git push` obeys; start again to "
+                "use it"
+            )
         reference = self.objects.references[repositories.MAIN]
         try:
             with self.new.packed(commit):
@@ -180,6 +149,48 @@ class LocalRepository(StateRepository):
                     f"{self.address} cannot be written: {lock} cannot be removed "
                     f"({error.strerror}); remove it"
                 ) from None
+
+
+# ---- a bare repository on this disk that only git can write as its owner wants ----
+
+_HOOKS = ("pre-receive", "update", "post-receive", "post-update", "reference-transaction")
+# What a push may do, and who may read what it writes. The objects that this program makes would
+# pass git's check of objects, and it always keeps them packed.
+_SETTINGS = re.compile(
+    r"core\.sharedrepository|transfer\.hiderefs|hook\..*|receive\.(?!fsckobjects$|unpacklimit$).*"
+)
+
+
+def needs_push(address: str) -> bool:
+    """Return whether a folder has a repository with hooks or settings that only git obeys."""
+    try:
+        repo = Repository(os.path.expanduser(address))  # noqa: PTH111 - the other one raises errors
+        settings = {entry.name.lower(): entry.value or "" for entry in repo.config}
+    except (pygit2.GitError, ValueError):
+        return False
+    hooks = Path(repo.path, os.path.expanduser(settings.get("core.hookspath", "hooks")))  # noqa: PTH111
+    return any(map(_SETTINGS.fullmatch, settings)) or any(
+        (hooks / name).is_file() and os.access(hooks / name, os.X_OK) for name in _HOOKS
+    )
+
+
+class PushedRepository(RemoteRepository):
+    on_this_disk = True
+
+    def __init__(self, place: LocalRepository, folder: Path, notify: Notify) -> None:
+        self._place = place
+        super().__init__(str(Path(place.objects.path).resolve()), folder, notify, False)
+
+    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
+        # to look is cheap, to fetch is not; git says why the repository cannot be read
+        with suppress(pygit2.GitError, KeyError, OSError, StateRepoError):
+            if self._place.tip() == self.tip():
+                return self.tip()
+        return super().refresh(urgent)
+
+    def tidy(self) -> None:
+        super().tidy()
+        self._place.tidy()
 
 
 # ---- what is only read: a person's checkout, and the last fetch of a URL ----
@@ -261,8 +272,8 @@ def connect(
 ) -> StateRepository:
     """Return the state repo at an address: a URL, or a folder where main is not checked out.
 
-    The clone of a URL is made in ``folder``; with ``allow_offline``, an existing one is used if its
-    remote is away. With ``only_read``, the address may also be the folder of a checkout.
+    The clone of what is pushed to is made in ``folder``; with ``allow_offline``, an existing one is
+    used if its remote is away. With ``only_read``, the address may also be that of a checkout.
     """
     if is_url(address):
         _check_url(address)
@@ -284,7 +295,12 @@ def connect(
             f"{address} does not exist{place}; correct the path, or make a state repo there with "
             f"`demandops init {address} --bare`"
         )
-    return Checkout(path) if is_read_only else LocalRepository(path)
+    if is_read_only:
+        return Checkout(path)
+    repository = LocalRepository(path)
+    if only_read or not needs_push(address):
+        return repository
+    return PushedRepository(repository, folder / "clone.git", notify)
 
 
 def _check_url(url: str) -> None:

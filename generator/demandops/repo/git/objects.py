@@ -8,86 +8,44 @@ import hashlib
 import os
 import re
 import shutil
-import struct
 import subprocess
 import weakref
-import zlib
-from bisect import bisect_right
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from io import BytesIO
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import NamedTuple
 
 import pygit2
+from gitdb.base import OStream
+from gitdb.pack import PackEntity
 from pygit2 import Oid, Repository, Signature, Tree
 from pygit2.enums import ObjectType
 
 from demandops.repo.git.signing import Signer
 from demandops.repo.git.tree import printable
 
-# ---- a pack and its index in Git's format ----
+# ---- a pack ----
 #
-# Each object is compressed and stored whole, not as a delta, because the search for deltas would
-# take longer than the rest of a demand's commit. Git's housekeeping makes deltas later.
+# gitdb stores each object whole, not as a delta; Git's housekeeping makes deltas later. libgit2
+# searches for deltas and reads the pack again: it takes 2.4 ms for the 20 objects of a demand and
+# 141 ms for 1,000, gitdb 1.2 and 21 ms.
 
-_KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
 _LEVEL = 1  # of compression; a pack is short-lived, so speed counts more than size
-_SHORT_OFFSETS = 1 << 31  # an index has a separate table for offsets of at least this value
-
-
-class Packed(NamedTuple):
-    oid: bytes
-    crc: int  # of the packed bytes, as the offset is
-    offset: int
 
 
 def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -> Path:
-    parts = [b"PACK" + struct.pack(">II", 2, len(objects))]
-    packed, offset = list[Packed](), len(parts[0])
-    for oid, kind, data in objects:
-        # 4 bits of the size are beside the type, 7 in each further byte; the top bit means more
-        byte, size = _KINDS[kind] << 4 | len(data) & 0xF, len(data) >> 4
-        header = bytearray()
-        while size:
-            header.append(byte | 0x80)
-            byte, size = size & 0x7F, size >> 7
-        header.append(byte)
-        part = bytes(header) + zlib.compress(data, _LEVEL)
-        packed.append(Packed(oid.raw, zlib.crc32(part), offset))
-        parts.append(part)
-        offset += len(part)
-    pack = b"".join(parts)
-    checksum = hashlib.sha1(pack).digest()  # noqa: S324 - Git's checksum
-    path = folder / f"pack-{checksum.hex()}.pack"
-    index = path.with_suffix(".idx")
-    for file, content in ((path, (pack, checksum)), (index, (index_of(packed, checksum),))):
+    streams = [OStream(o.raw, _TYPES[kind], len(data), BytesIO(data)) for o, kind, data in objects]
+    pack, index = BytesIO(), BytesIO()
+    name, _ = PackEntity.write_pack(streams, pack.write, index.write, len(streams), _LEVEL)
+    path = folder / f"pack-{name.hex()}.pack"
+    for file, content in ((path, pack), (path.with_suffix(".idx"), index)):
         handle = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o444)  # as git's packs
         with open(handle, "wb") as opened:  # noqa: PTH123 - opens a file descriptor
-            opened.writelines(content)
+            opened.write(content.getbuffer())
             opened.flush()
             os.fsync(handle)
     return path
-
-
-def index_of(packed: Iterable[Packed], checksum: bytes) -> bytes:
-    # version 2 of the format
-    packed = sorted(packed)
-    firsts = [item.oid[0] for item in packed]
-    far = [item.offset for item in packed if item.offset >= _SHORT_OFFSETS]
-    places = {offset: _SHORT_OFFSETS | place for place, offset in enumerate(far)}
-    parts = [
-        b"\xfftOc" + struct.pack(">I", 2),
-        # git looks an id up by its first byte: how many ids begin with at most this byte
-        struct.pack(">256I", *(bisect_right(firsts, first) for first in range(256))),
-        b"".join(item.oid for item in packed),
-        struct.pack(f">{len(packed)}I", *(item.crc for item in packed)),
-        struct.pack(f">{len(packed)}I", *(places.get(i.offset, i.offset) for i in packed)),
-        struct.pack(f">{len(far)}Q", *far),
-        checksum,
-    ]
-    index = b"".join(parts)
-    return index + hashlib.sha1(index).digest()  # noqa: S324 - Git's checksum
 
 
 # ---- new objects: kept in memory, then written to the disk as one pack ----

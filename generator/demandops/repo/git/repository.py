@@ -17,6 +17,7 @@ from pygit2 import Oid, Repository, Tree
 from demandops.base.errors import StateRepoError, Unsound
 from demandops.base.runtime import REAL, Runtime
 from demandops.base.settings import MAIN_BRANCH
+from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
 from demandops.repo.git.objects import NewObjects
@@ -95,13 +96,41 @@ def missing_main(address: str) -> StateRepoError:
     )
 
 
-def unopened(folder: Path, error: Exception) -> StateRepoError | None:
-    """Return the error to raise if Git cannot open a folder; None if it is no Git repository."""
-    if not ((folder / ".git").exists() or (folder / "HEAD").is_file()):
+PARTIAL = (
+    "{0} is a clone that was made with --filter and lacks objects; fetch them: "
+    "git -C {0} fetch --refetch --no-filter origin"
+)
+
+
+def lacks_objects(repo: Repository) -> bool:
+    # by what `git clone --filter` writes into the configuration
+    filtered = (".promisor", ".partialclonefilter")
+    return any(entry.name.endswith(filtered) for entry in repo.config)
+
+
+def open_folder(folder: Path) -> Repository | None:
+    """Open the Git repository of a folder; None if it has none."""
+    try:
+        repo = Repository(str(folder))
+    except pygit2.GitError as error:
+        if not ((folder / ".git").exists() or (folder / "HEAD").is_file()):
+            return None
+        raise StateRepoError(
+            f"{folder} is a Git repository that cannot be opened: {error}; if it belongs to "
+            f"another user, run `git config --global --add safe.directory {folder.resolve()}`"
+        ) from None
+    # libgit2 looks for a repository in the folders around it too
+    here, around = folder.resolve(), Path(repo.workdir or repo.path).resolve()
+    if here in (around, Path(repo.path).resolve()) or not here.is_relative_to(around):
+        return repo
+    path = here.relative_to(around)
+    if repo.is_bare or repo.path_is_ignored(f"{path}/"):
         return None
-    return StateRepoError(
-        f"{folder} is a Git repository that cannot be opened: {error}; if it belongs to another "
-        f"user, run `git config --global --add safe.directory {folder.resolve()}`"
+    if (around / ROOT_FILE).is_file():
+        raise StateRepoError(f"{folder} is a folder of the state repo {around}; name {around}")
+    raise StateRepoError(
+        f"{folder} is a folder of the Git repository {around}, but a state repo is a repository of "
+        f"its own; make it one, for example with `git subtree split --prefix={path} -b fleet`"
     )
 
 
@@ -111,8 +140,9 @@ def access_error(error: Exception, address: str, objects: Repository | None = No
     is_missing = isinstance(error, KeyError) and isinstance(error.args[0], Oid)
     if not (is_missing or isinstance(error, OSError | pygit2.GitError)):
         return error
-    # the text of a KeyError would have quotes
-    what = str(error.args[0]) if isinstance(error, KeyError) else str(error)
+    what = f"Git object {error.args[0]} is missing" if is_missing else str(error)
+    if objects is not None and not isinstance(error, OSError) and lacks_objects(objects):
+        return StateRepoError(PARTIAL.format(address))
     if objects is not None and (oid := re.search("[0-9a-f]{40}", what)):
         place = trees.place_of(Repository(objects.path), Oid(hex=oid[0]))
         what = f"{place}, Git object {oid[0]}, is missing or damaged" if place else what
@@ -145,6 +175,7 @@ class StateRepository(ABC):
     # called again and again while this waits for git
     while_waiting: Callable[[], object] = staticmethod(lambda: None)
     always_current: bool  # whether the tip needs no fetch, as in a repository on this disk
+    on_this_disk = False  # whether it costs nearly nothing to look for new commits
     _tidying: subprocess.Popen[bytes] | None = None
     # of the tip: main, its remote-tracking branch, or HEAD of a checkout
     main_reference = MAIN
@@ -208,9 +239,9 @@ class StateRepository(ABC):
         except StateRepoError:
             return None
 
-    @abstractmethod
     def renew_if_damaged(self) -> bool:
-        """Let git check the files, and replace a damaged clone; return whether it was replaced."""
+        """Let git check a clone, and replace a damaged one; return whether it was replaced."""
+        return False
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End the running transfer with a remote, if any; later ones raise RemoteAway."""

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import os
 import re
-import stat
-from collections.abc import Mapping
+import shutil
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pygit2
-from pygit2 import Commit, Repository
+from pygit2 import Commit, Repository, Tree
 
 from demandops.base import strict_yaml
-from demandops.base.errors import Fault, InvalidInput, StateRepoError, fault
+from demandops.base.errors import InvalidInput, StateRepoError, fault
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import API_VERSION, GENERATED_ROOTS, MAIN_BRANCH, modeline
@@ -24,10 +27,12 @@ from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.override import OVERRIDES_ROOT
+from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.release import Release, ServiceRelease
+from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
-from demandops.repo.git.repository import reading, unopened
+from demandops.repo.git.repository import PARTIAL, open_folder, reading
 from demandops.repo.history import revisions
 from demandops.repo.load import snapshot as snapshots
 
@@ -133,14 +138,121 @@ def _merge_patch(
     return patch
 
 
-# ---- the checkout: its files, and the commit that an edit started from ----
+# ---- the tree that Git would make of a checkout ----
+#
+# What counts is what Git would commit: what filters and conversions of line ends make of the files,
+# without ignored ones. So git itself makes the tree, in a temporary index and folder of objects.
+# It runs only filters that the configuration of this machine names.
 
-_ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT, *GENERATED_ROOTS)
-_DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
+ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT, *GENERATED_ROOTS)
 # A fleet of 20,000 nodes has fewer; more would fill the memory of the machine that checks.
-_MOST_BYTES = 16 << 20
-_MOST_BYTES_IN_ALL = 1 << 30
-_MOST_FILES = 500_000
+_LARGEST, _MOST = 16 << 20, 1 << 30  # bytes of a file, and of all
+_NO_PROGRAMS = ("-c", "core.fsmonitor=false", "-c", f"core.hooksPath={os.devnull}")
+_NO_SPLIT = ("-c", "core.splitIndex=false")  # or git would write into the checkout's repository
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[tuple[Repository, Tree]]:
+    """Yield a checkout's repository, and the tree that git would make of the files in ``ROOTS``.
+
+    Files without Git are in an empty repository meanwhile.
+    """
+    with TemporaryDirectory(prefix="demandops-check-") as scratch:
+        repo = open_folder(folder)
+        if repo is not None and repo.is_bare:
+            raise StateRepoError(
+                f"{folder} is a bare repository, which has no files to edit; clone it, and use the "
+                f"clone: git clone {folder}"
+            )
+        if repo is None:
+            repo = pygit2.init_repository(f"{scratch}/empty.git", bare=True)
+        with reading(str(folder), repo):
+            tree = _written_tree(folder, repo, Path(scratch))
+            if ROOT_FILE not in tree:
+                raise StateRepoError(
+                    f"{folder} is not a state repo, because it has no {ROOT_FILE}; name a checkout "
+                    "of one, or make one with `demandops init`"
+                )
+            yield repo, tree
+
+
+def _written_tree(folder: Path, repo: Repository, scratch: Path) -> Tree:
+    index, objects = scratch / "index", scratch / "objects"
+    environment = {
+        "GIT_DIR": repo.path,
+        "GIT_WORK_TREE": str(folder.resolve()),
+        "GIT_INDEX_FILE": str(index),
+        "GIT_OBJECT_DIRECTORY": str(objects),
+        # a partial clone must not fetch; before Git 2.44 only the latter prevents that
+        **{"GIT_NO_LAZY_FETCH": "1", "GIT_ALLOW_PROTOCOL": "none", "LC_ALL": "C"},
+    }
+
+    def git(*arguments: str, stdin: bytes = b"") -> list[bytes]:
+        done = subprocess.run(
+            ["git", *_NO_PROGRAMS, *_NO_SPLIT, *arguments],
+            cwd=folder,
+            env=os.environ | child_processes.mark() | environment,
+            input=stdin,
+            capture_output=True,
+            check=False,
+        )
+        if done.returncode and b"promisor" in done.stderr:
+            raise StateRepoError(PARTIAL.format(folder))
+        if done.returncode:
+            told = done.stderr.decode(errors="replace").strip().splitlines()
+            raise StateRepoError(
+                f"{folder} cannot be read as git would commit it: {'; '.join(told)}; mend it until "
+                "`git add --all` succeeds"
+            )
+        return [part for part in done.stdout.removesuffix(b"\n").split(b"\0") if part]
+
+    shared = Path(repo.path, "commondir")  # of a linked work tree
+    common = shared.read_text().strip() if shared.is_file() else ""
+    (objects / "info").mkdir(parents=True)
+    store = Path(repo.path, common, "objects").resolve()
+    (objects / "info" / "alternates").write_text(f"{store}\n")
+    if (own := Path(repo.path, "index")).is_file():
+        # with its time, after which git reads files again whose size and time are as before
+        shutil.copy2(own, index)
+    unmerged = {entry.partition(b"\t")[2] for entry in git("ls-files", "--unmerged", "-z")}
+    _refuse(dict.fromkeys(unmerged, "is not merged yet; edit it as it shall be, and `git add` it"))
+    new = git("ls-files", "--others", "--exclude-standard", "-z", "--", *ROOTS)
+    _refuse({path.rstrip(b"/"): _NESTED for path in new if path.endswith(b"/")})
+    git("add", "--update")
+    git("update-index", "--add", "--replace", "-z", "--stdin", stdin=b"\0".join(new))
+    (tree,) = git("write-tree", "--missing-ok")
+    entries = git("ls-tree", "-r", "-l", "-z", tree.decode(), *ROOTS)
+    listed = [entry.partition(b"\t") for entry in entries]
+    _refuse({path: _why_not_read(about, path) for about, _, path in listed})
+    if sum(int(about.split()[3]) for about, _, _ in listed) > _MOST:
+        raise StateRepoError(f"{folder} has more than {_MOST >> 20} MiB to check; take files out")
+    repo.odb.add_disk_alternate(str(objects))
+    return repo[tree.decode()].peel(Tree)
+
+
+_NESTED = "belongs to another Git repository, whose files are not read; remove it"
+
+
+def _refuse(reasons: Mapping[bytes, str]) -> None:
+    faults = [fault("", why).within(trees.printable(path)) for path, why in reasons.items() if why]
+    if faults:
+        raise InvalidInput(faults)
+
+
+def _why_not_read(about: bytes, path: bytes) -> str:
+    mode, _, _, size = about.split()
+    if mode == b"120000":  # it may point to a file that the report must not show
+        return "is a symbolic link, which is not followed; replace it by a file"
+    if mode == b"160000":
+        return _NESTED
+    if path.count(b"/") > trees.MAX_DEPTH:
+        return f"is more than {trees.MAX_DEPTH} folders deep; move it up"
+    return f"has more than {_LARGEST >> 20} MiB; make it smaller" if int(size) > _LARGEST else ""
+
+
+# ---- the commit that an edit started from ----
+
+_DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
 _SHALLOW = (
     "this clone is shallow and lacks the commit that the edit started from; fetch all commits: "
     "git fetch --unshallow origin (in a pipeline, set fetch-depth: 0 or GIT_DEPTH: 0)"
@@ -163,112 +275,46 @@ class Base:
         return changeset.planned_releases(self.state) if self.state else {}
 
 
-def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
-    """Return the state repo's files as path → text, and a fault for each entry that is not read."""
-    # The author of a pull request may be hostile, so only plain files inside of the folder are
-    # read, and no other code of the check reads the checkout.
-    if not os.path.lexists(folder / "demandops.yaml"):  # is_file follows a link, and may fail
-        if (folder / "HEAD").is_file():
-            raise StateRepoError(
-                f"{folder} is a bare repository, which has no files to edit; clone it, and use the "
-                f"clone: git clone {folder}"
-            )
-        raise StateRepoError(
-            f"{folder} is not a state repo, because it has no demandops.yaml; name a checkout of "
-            "one, or make one with `demandops init`"
-        )
-    files, faults, size = dict[str, str](), list[Fault](), 0
-    waiting = [folder / root for root in reversed(_ROOTS)]
-    while waiting:
-        path = waiting.pop()
-        parts = path.relative_to(folder)
-        name = os.fsencode(parts).decode("utf-8", "backslashreplace")
-        try:
-            status = path.lstat()
-            if message := _why_not_read(path.name, len(parts.parts), status):
-                faults.append(fault("", message).within(name))
-            elif stat.S_ISDIR(status.st_mode):
-                waiting += sorted(path.iterdir(), reverse=True)
-            else:
-                files[name] = path.read_bytes().decode("utf-8", "replace")
-                size += status.st_size
-        except FileNotFoundError:  # one of _ROOTS
-            continue
-        except OSError as error:
-            raise StateRepoError(f"{path} cannot be read: {error.strerror}") from None
-        if size > _MOST_BYTES_IN_ALL or len(files) + len(waiting) > _MOST_FILES:
-            raise StateRepoError(
-                f"{folder} has more than {_MOST_FILES:,} files or {_MOST_BYTES_IN_ALL >> 20} MiB "
-                "to check; take some out"
-            )
-    return files, faults
-
-
-def _why_not_read(name: str, depth: int, status: os.stat_result) -> str:
-    if stat.S_ISLNK(status.st_mode):  # it may point to a file that the report must not show
-        return "is a symbolic link, which is not followed; replace it by a file"
-    if not (stat.S_ISDIR(status.st_mode) or stat.S_ISREG(status.st_mode)):
-        return "is neither a file nor a folder; remove it"
-    if name.lower() == ".git":  # some file systems do not tell .GIT from .git
-        return "belongs to another Git repository, whose files are not read; remove it"
-    if stat.S_ISDIR(status.st_mode):
-        deep = f"is more than {trees.MAX_DEPTH} folders deep; move it up"
-        return deep if depth > trees.MAX_DEPTH else ""
-    large = f"has more than {_MOST_BYTES >> 20} MiB; make it smaller"
-    return large if status.st_size > _MOST_BYTES else ""
-
-
-def base_of(folder: Path, revision: str | None) -> Base | None:
+def base_of(repo: Repository, revision: str | None) -> Base | None:
     # ``revision`` is the merge target; by default ``origin/main``, else ``main``. If there is
-    # neither, the edit is compared with HEAD. None if the folder is no checkout with a commit.
-    try:
-        repo = Repository(str(folder))
-    except pygit2.GitError as error:
-        if reason := unopened(folder, error):
-            raise reason from None
-        if revision is not None:
-            raise StateRepoError(f"{folder} is not a Git checkout; leave out --base") from None
-        return None
-    if "core.sparsecheckout" in repo.config and repo.config.get_bool("core.sparsecheckout"):
-        raise StateRepoError(
-            f"{folder} is a sparse checkout, which lacks files; check out all files with "
-            "`git sparse-checkout disable`"
-        )
+    # neither, the edit is compared with HEAD. None without a commit.
     if repo.is_empty or repo.head_is_unborn:
-        return None
-    with reading(str(folder), repo):
-        target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
-        head = repo.head.peel(Commit)
-        try:
-            tip = revisions.resolve(repo, head.id, target, REAL.now()) if target else None
-            common = repo.merge_base(head.id, tip.id) if tip is not None else None
-        except (StateRepoError, pygit2.GitError, KeyError):
-            if repo.is_shallow:
-                raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
-            raise
-        if common is None and repo.is_shallow:
-            raise StateRepoError(_SHALLOW)
-        if common is None and target:
+        if revision is not None:
             raise StateRepoError(
-                f"HEAD and {target} have no commit in common; name the merge target with --base"
+                "the folder has no commit or is not a Git checkout; leave out --base"
             )
-        commit = head if common is None else trees.commit_of(repo, common)
-        base = Base(str(commit.id), trees.texts(commit.tree, _ROOTS), None, False)
-        if tip is not None:
-            _, newer = repo.ahead_behind(head.id, tip.id)
-            merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
-            name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
-            base = replace(base, target=name, newer=newer, merged=merged)
-        try:
-            snapshot = snapshots.state_at(repo, commit.id)
-        except (InvalidInput, StateRepoError):
-            return base
-        return replace(base, state=snapshot.state, valid=not snapshot.problems)
-
-
-def author_of(folder: Path) -> str:
+        return None
+    target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
+    head = repo.head.peel(Commit)
     try:
-        repo = Repository(str(folder))
+        tip = revisions.resolve(repo, head.id, target, REAL.now()) if target else None
+        common = repo.merge_base(head.id, tip.id) if tip is not None else None
+    except (StateRepoError, pygit2.GitError, KeyError):
+        if repo.is_shallow:
+            raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
+        raise
+    if common is None and repo.is_shallow:
+        raise StateRepoError(_SHALLOW)
+    if common is None and target:
+        raise StateRepoError(
+            f"HEAD and {target} have no commit in common; name the merge target with --base"
+        )
+    commit = head if common is None else trees.commit_of(repo, common)
+    base = Base(str(commit.id), trees.texts(commit.tree, ROOTS), None, False)
+    if tip is not None:
+        _, newer = repo.ahead_behind(head.id, tip.id)
+        merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
+        name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
+        base = replace(base, target=name, newer=newer, merged=merged)
+    try:
+        snapshot = snapshots.state_at(repo, commit.id)
+    except (InvalidInput, StateRepoError):
+        return base
+    return replace(base, state=snapshot.state, valid=not snapshot.problems)
+
+
+def author_of(repo: Repository) -> str:
+    try:
         return str(repo.head.peel(Commit).author.name)
     except (pygit2.GitError, LookupError, ValueError):  # also an encoding that nobody knows
         return ""

@@ -35,7 +35,7 @@ from demandops.render.gitops import BOOTSTRAP_ROOT, path_of
 from demandops.repo.git import tree as trees
 from demandops.repo.load import ledger_files
 from demandops.repo.merge_check import edited_checkout, rendered_charts
-from demandops.repo.merge_check.edited_checkout import Base, author_of, base_of, files_of
+from demandops.repo.merge_check.edited_checkout import Base, author_of, base_of
 from demandops.repo.merge_check.rendered_charts import RenderedCharts
 from demandops.templating import charts
 from demandops.templating.evaluator import EVALUATE
@@ -84,11 +84,15 @@ def check(
     ancestor of HEAD and the merge target ``base``, by default ``origin/main``, else ``main``, and
     without one with HEAD. Overrides that ended before ``now`` do not apply.
     """
-    files, faults = files_of(folder)
-    start = base_of(folder, base)
+    try:
+        with edited_checkout.opened(folder) as (repo, tree):
+            files = trees.texts(tree, edited_checkout.ROOTS)
+            start, owner = base_of(repo, base), author_of(repo)
+    except InvalidInput as error:  # of what is no plain file
+        return CheckResult(error.faults)
     edit = _Edit(files, start, now or REAL.now())
     claims = ledger_files.read_claims(sorted(files.items()))
-    faults += claims.faults
+    faults = list(claims.faults)
     edited = [path for path in edit.changed if _is_written_by_generator(path)]
     result = CheckResult(
         (),
@@ -150,7 +154,7 @@ def check(
             ),
         )
     if start is not None and edited:
-        suggestions = _suggestions(files, start, edited, author_of(folder))
+        suggestions = _suggestions(files, start, edited, owner)
         faults += [
             fault(
                 "", _remedy(path, start.files.get(path), files.get(path), suggestions.get(path))
