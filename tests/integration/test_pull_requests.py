@@ -438,3 +438,32 @@ def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Run
     assert ran.out.startswith(f"{MARK}\n## DemandOps: valid")
     assert "Releases: 3 to change." in ran.out
     assert "\n3 parts of this report are left out because " in ran.out[-200:]
+
+
+# ---- what main has become meanwhile ----
+
+NODE = "apiVersion: demandops/v1\nkind: Nodes\nnodes: [{id: late, type: vehicle, cluster: c-its}]\n"
+
+
+@pytest.mark.parametrize(
+    ("on_main", "told"),
+    [
+        # a fault of somebody else, with which nothing of a merge would be in effect
+        ({"overrides/odd.yaml": "kind: Nothing\n"}, "overrides/odd.yaml: apiVersion: is missing"),
+        # and one that neither side has alone
+        ({"inventory/nodes/other.yaml": NODE}, "'late' is in inventory/nodes/other.yaml too"),
+    ],
+)
+def test_the_merged_result_is_judged(
+    branch: Path, check: Run, state: GitRepo, on_main: dict[str, str], told: str
+) -> None:
+    file = branch / "inventory" / "nodes" / "mine.yaml"
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(NODE)
+    commit(branch)
+    assert check().code == 0
+    state.commit(on_main)
+    git(branch, "fetch", "--quiet", "origin")
+    ran = check()
+    assert ran.code == 1
+    assert told in ran.err and "(once merged into origin/main, which has newer commits)" in ran.err

@@ -101,7 +101,7 @@ def _findings(checked: CheckResult) -> Iterator[str]:
         yield "## DemandOps: valid, and every release renders\n"
     yield from (f"\n{line}\n" for line in chart_lines(checked.charts, code))
     if checked.base:
-        invalid = "; instead of its invalid files, their last valid versions were compared"
+        invalid = "; it is not valid, so what is in effect at it was compared"
         yield f"\nCompared with {code(checked.base[:10])}{'' if checked.base_valid else invalid}.\n"
     for kind, faults in (("", checked.faults), ("warning: ", checked.warnings)):
         for fault in faults:
@@ -299,7 +299,7 @@ def _lines(checked: CheckResult) -> Iterator[str]:
         compared = f", compared with {checked.base[:10]}" if checked.base else ""
         yield f"\nwhat merging would do{compared}:"
     if checked.base and not checked.base_valid:
-        yield f"({checked.base[:10]} has invalid files, so their last valid versions are compared)"
+        yield f"({checked.base[:10]} is not valid, so what is in effect at it is compared)"
     if consequence.releases:
         yield "\ndesired state:"
         yield from (f"  {line}" for line in release_lines(consequence.releases))

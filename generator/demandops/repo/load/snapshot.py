@@ -182,8 +182,8 @@ def configuration_of(repo: Repository, commit: Commit, entry: LogEntry | None) -
     return found
 
 
-# By the commit of a configuration, the newest one along whose first parents it was found. Each commit
-# made while another is not valid would else be followed back to it.
+# By the commit of a configuration, the newest one that has it along its first parents. Else each
+# commit that is made while main is not valid would be followed back to it.
 _on_line_of: dict[Oid, Oid] = {}
 
 

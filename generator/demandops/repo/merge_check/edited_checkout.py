@@ -263,13 +263,12 @@ _SHALLOW = (
 class Base:
     commit: str
     files: Mapping[str, str]
-    # in effect at this commit, with last valid versions; None if there never was a valid state
-    state: State | None
-    valid: bool  # whether all files of the commit are valid
+    state: State | None  # in effect at this commit; None if there never was a valid one
+    valid: bool  # whether it is of all files of the commit
     target: str = ""  # the merge target as git names it, such as ``origin/main``, if there is one
     newer: int = 0  # how many commits of the merge target the checkout lacks
-    # the merge target's generated files, if the checkout lacks commits of it
-    merged: Mapping[str, str] = field(default_factory=dict)
+    # the merge target's files, if the checkout lacks commits of it
+    theirs: Mapping[str, str] = field(default_factory=dict)
 
     def releases(self) -> dict[ReleaseKey, Release]:
         return changeset.planned_releases(self.state) if self.state else {}
@@ -303,9 +302,9 @@ def base_of(repo: Repository, revision: str | None) -> Base | None:
     base = Base(str(commit.id), trees.texts(commit.tree, ROOTS), None, False)
     if tip is not None:
         _, newer = repo.ahead_behind(head.id, tip.id)
-        merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
+        theirs = trees.texts(tip.tree, ROOTS) if newer else {}
         name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
-        base = replace(base, target=name, newer=newer, merged=merged)
+        base = replace(base, target=name, newer=newer, theirs=theirs)
     try:
         snapshot = snapshots.state_at(repo, commit.id)
     except (InvalidInput, StateRepoError):

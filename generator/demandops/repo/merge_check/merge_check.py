@@ -63,7 +63,7 @@ class CheckResult:
     # also None if the base's bookkeeping is not known; empty if there is no base
     bookkeeping: tuple[EntryChange, ...] | None = None
     base: str | None = None  # the commit that the checkout is compared with
-    base_valid: bool = True  # if not, the last valid versions of its files are compared
+    base_valid: bool = True  # if not, what is in effect at it is compared
     # the name of the merge target, and how many commits it has that the checkout lacks
     target: str = ""
     newer: int = 0
@@ -153,6 +153,8 @@ def check(
                 *charts.warnings,
             ),
         )
+    if start is not None and start.theirs and not faults:
+        faults += edit.faults_once_merged(start)
     if start is not None and edited:
         suggestions = _suggestions(files, start, edited, owner)
         faults += [
@@ -272,13 +274,35 @@ class _Edit:
         }
 
     def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
-        files, merged = self.generated_before, self.start.merged if self.start else {}
-        for path in {*merged, *files} if merged else ():
+        files, theirs = self.generated_before, self.start.theirs if self.start else {}
+        for path in {*filter(_generated, theirs), *files} if theirs else ():
             # what the merge target has already is no effect of this merge
-            if merged.get(path) == wanted.get(path):
+            if theirs.get(path) == wanted.get(path):
                 files.pop(path, None)
                 files |= {path: wanted[path]} if path in wanted else {}
         return files
+
+    def faults_once_merged(self, start: Base) -> Iterator[Fault]:
+        # of the edit and the newer commits of the merge target together, or of these commits alone
+        merged = dict(self.files)
+        for path in {*start.files, *start.theirs}:
+            was, theirs = start.files.get(path), start.theirs.get(path)
+            # what both have changed is for git to merge
+            if was != theirs and self.files.get(path) == was:
+                merged.pop(path, None)
+                merged |= {path: theirs} if theirs is not None else {}
+        whole, claims = (
+            replace(self, files=merged),
+            ledger_files.read_claims(sorted(merged.items())),
+        )
+        faults = list(claims.faults)
+        try:
+            whole.rendered(whole.merged_state(whole.config(), claims.ledger()))
+        except InvalidInput as error:
+            faults += error.faults
+        for each in faults:
+            message = f"{each.message} (once merged into {start.target}, which has newer commits)"
+            yield replace(each, message=message)
 
     def config(self) -> Config:
         files = {p: text for p, text in self.files.items() if p.split("/")[0] in CONFIG_ROOTS}
