@@ -159,7 +159,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
             # lead only once the journal's demands are published, or cannot be published now
             leadership = Leadership(
                 leader_lease,
-                lambda: not generator.unpublished or bool(generator.remote_status.unreachable),
+                lambda: not generator.unpublished or bool(generator.remote_status.blocked),
                 signals.wake,
             )
             parts.callback(leadership.close)

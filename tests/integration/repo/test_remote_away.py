@@ -76,7 +76,7 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
         for number in range(256):  # the server fails to store objects
             (objects / f"{number:02x}").touch()
         ticket = generator.submit(goal(1))
-        rig.wait_until(lambda: "cannot be pushed to: un" in caplog.text, "the log says why")
+        rig.wait_until(lambda: "rejects the push: un" in caplog.text, "the log says why")
         assert not ticket.future.done()
         shutil.rmtree(objects)
         aside.rename(objects)

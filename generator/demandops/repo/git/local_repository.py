@@ -67,8 +67,7 @@ class LocalRepository(StateRepository):
     def renew_if_damaged(self) -> bool:
         """Raise StateRepoError if git finds damage: there is no remote to clone from."""
         checked = subprocess.run(
-            ["git", "fsck", "--no-dangling", "--no-progress"],
-            cwd=self.objects.path,
+            [*repositories.git(self.objects.path), "fsck", "--no-dangling", "--no-progress"],
             env=os.environ | repositories.git_environment(),
             capture_output=True,
             text=True,

@@ -35,16 +35,33 @@ _ENVIRONMENT = {
 }
 
 
+# Of a person's settings, those for access to the server count; those that start hooks, send more
+# or colour what is parsed do not. The repository is named, as safe.bareRepository may hide it.
+_SETTINGS = (
+    f"core.hooksPath={os.devnull}", "push.pushOption=", "color.ui=false", "gc.auto=0",
+    "maintenance.auto=false",
+)  # fmt: skip
+
+
 def git_environment() -> dict[str, str]:
     return _ENVIRONMENT | child_processes.mark()
+
+
+def git(folder: Path | str) -> list[str]:
+    """Return how a command line begins that runs git in the bare repository ``folder``."""
+    return ["git", f"--git-dir={folder}", *(word for each in _SETTINGS for word in ("-c", each))]
 
 
 class Unavailable(StateRepoError):
     """Raised when the state repo cannot be read or written now; demands stay in the journal."""
 
+    def __init__(self, text: str, retry_after_s: float = 0.0) -> None:
+        super().__init__(text)
+        self.retry_after_s = retry_after_s  # what the server asks for
+
 
 class RemoteAway(Unavailable):
-    """Raised without network or rights to fetch, or if a push fails for a temporary reason."""
+    """Raised when the remote cannot be read, or nobody answers a push."""
 
 
 class DiskFull(Unavailable):
@@ -56,7 +73,15 @@ class FetchInterrupted(StateRepoError):
 
 
 class PushDenied(StateRepoError):
-    """Raised when a write fails for a lasting reason, such as a hook or a protected branch."""
+    """Raised when a push fails although the remote can be read, or the disk permits no write.
+
+    Whether the commits or the writer are refused, only further pushes show. Without a verdict of
+    the server, such as over SSH, the connection may have failed.
+    """
+
+    def __init__(self, text: str, *, is_verdict: bool = True) -> None:
+        super().__init__(text)
+        self.is_verdict = is_verdict
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -222,8 +247,7 @@ class StateRepository(ABC):
         self._tidying = subprocess.Popen(
             # --geometric joins a pack only with those of about its size, so that a demand's small
             # pack does not let git write the whole history again
-            ["git", "repack", "--geometric=2", "-d", "-l", "--quiet"],
-            cwd=self.objects.path,
+            [*git(self.objects.path), "repack", "--geometric=2", "-d", "-l", "--quiet"],
             env=os.environ | git_environment(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

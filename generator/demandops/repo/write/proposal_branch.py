@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 
-import git
 from pygit2 import GitError, Oid, Repository, Tree
 
 from demandops.base import naming
@@ -33,7 +32,7 @@ log = logging.getLogger("demandops")
 
 PREFIX = "demand/"
 _HEADS = "refs/heads/"
-_NO_OPTIONS = re.compile(r"does not support push options")
+_NO_OPTIONS = re.compile(r"^fatal: the receiving end does not support push options", re.MULTILINE)
 _LINK = re.compile(r"https?://\S+")
 
 
@@ -110,22 +109,21 @@ class ProposalBranches:
             except (GitError, OSError) as error:
                 raise self._why_denied(branch) or error from None
             return ""
-        try:
-            spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
-            output = self._remote.push(spec, lease, options)
-            lines = [line for line in output.splitlines() if line.startswith("remote:")]
+        spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
+        pushed = self._remote.push(spec, lease, options)
+        if not pushed.code:
+            lines = [line for line in pushed.err.splitlines() if line.startswith("remote:")]
             links = [link[0] for line in lines if (link := _LINK.search(line))]
             # GitLab prints how to make a merge request, or the one that exists
             return next((link for link in links if "/merge_requests/" in link), "")
-        except git.GitCommandError as error:
-            if options and _NO_OPTIONS.search(str(error.stderr)):
-                return self._move(branch, commit, expected)
-            now = self.heads().branches.get(branch, "")
-            if now == wanted:
-                return ""  # the push succeeded, but the answer was lost
-            if now != expected:
-                raise BranchMoved(branch) from None
-            raise self._why_denied(branch) or self._remote.push_error(error) from None
+        if options and _NO_OPTIONS.search(pushed.err):
+            return self._move(branch, commit, expected)
+        now = self.heads().branches.get(branch, "")
+        if now == wanted:
+            return ""  # the push succeeded, but the answer was lost
+        if now != expected:
+            raise BranchMoved(branch)
+        raise self._why_denied(branch) or self._remote.push_error(pushed, reference)
 
     def _why_denied(self, branch: str) -> PushDenied | None:
         folders = (branch[:end] for end, letter in enumerate(branch) if letter == "/")
