@@ -124,7 +124,7 @@ def test_a_remote_with_main_checked_out_is_told_instead_of_tried_for_ever(
     bare: Path, person: Person
 ) -> None:
     person.fetch()
-    with rig.running(person.folder.as_uri()) as generator:
+    with rig.running(person.folder.as_uri(), refusal_patience_s=0.5) as generator:
         ticket = generator.submit(goal(1))
         with pytest.raises(StateRepoError, match="checked out"):
             rig.receipt(ticket)
