@@ -597,6 +597,7 @@ class Worker:
     def _carry_out_changes(self) -> bool:
         """Publish the effects of people's changes; return whether a commit was published."""
         # the caller has fetched the changes
+        self._leaves_due_work = False
         for _ in range(_TRIES):
             commits = self._new_commit_batch()
             if commits.publish():

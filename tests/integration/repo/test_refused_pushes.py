@@ -59,11 +59,11 @@ def test_who_breaks_a_rule_of_the_server_is_told_and_the_others_are_booked(
 def test_a_demand_that_is_too_large_for_the_server_holds_up_nobody(
     http: str, server: Server, bare: Path
 ) -> None:
-    server.faults.largest_push = 8_000
+    server.faults.largest_push = 30_000
     large = goals.put("large", "vehicle01", topic=("/a", "vehicle01"))
     large["applications"][0]["inputs"]["ego_data"] = [
         {"topic": f"/t{sha256(b'%d' % number).hexdigest()}", "source": "vehicle01"}
-        for number in range(200)
+        for number in range(600)
     ]
     with rig.running(http) as generator:
         with rig.busy(generator, goal(0)):
