@@ -236,7 +236,7 @@ class Clone(RemoteRepository):
             return _pushed(arguments, "[rejected] (stale info)")
         if not commit:
             references.delete(reference)
-            return GitResult(0, "", "")
+            return _pushed(arguments, "[deleted]", 0)
         if reference == MAIN:
             if not self._machine.world.remote.descendant_of(commit, now):
                 self._machine.world.failure = AssertionError("history was rewritten")
@@ -247,15 +247,15 @@ class Clone(RemoteRepository):
             )
         references.create(reference, commit, force=True)
         self._machine.world.on_push()
-        return GitResult(0, "", "")
+        return _pushed(arguments, f"{now}..{commit}", 0)
 
 
 def _failed(text: str) -> GitResult:
     return GitResult(128, "", text)
 
 
-def _pushed(command: tuple[str, ...], what: str) -> GitResult:
-    return GitResult(1, f"!\t{command[-1]}\t{what}\n", "")
+def _pushed(command: tuple[str, ...], what: str, code: int = 1) -> GitResult:
+    return GitResult(code, f"{'!' if code else ' '}\t{command[-1]}\t{what}\n", "")
 
 
 class World:

@@ -265,7 +265,8 @@ class Worker:
                 # the connection may have ended after the remote accepted the push
                 for ticket in batch:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
-                if self._record_failure(reason) >= self._refusal_patience_s:
+                patience_s = self._refusal_patience_s - self._record_failure(reason)
+                if patience_s <= 0:
                     self._demands.fail(batch, reason)
                     batch.clear()
                     return
@@ -273,6 +274,8 @@ class Worker:
                 wait = self._backoff.unreachable()
                 if isinstance(reason, Unavailable):
                     wait = max(wait, reason.retry_after_s)
+                else:
+                    wait = min(wait, patience_s)
             if wait is None:
                 continue
             # Wait before the fetch, not after it, because the push must follow the fetch closely.

@@ -34,7 +34,7 @@ from demandops.serve.generator import Generator
 # ---- booking, and printing the changes ----
 
 # A person who waits at a terminal is told soon that the server refuses every commit.
-_REFUSAL_PATIENCE_S = 2.0
+_REFUSAL_PATIENCE_S = 4.0
 
 
 def await_answer(future: Future[Any]) -> None:

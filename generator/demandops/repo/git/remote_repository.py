@@ -29,6 +29,7 @@ from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.repo.git import repository as repositories
+from demandops.repo.git import slow_git
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.repository import (
     MAIN,
@@ -37,7 +38,6 @@ from demandops.repo.git.repository import (
     RemoteAway,
     Unavailable,
 )
-from demandops.repo.git.slow_git import SlowGit
 
 log = logging.getLogger("demandops")
 
@@ -68,8 +68,8 @@ _HTTP = re.compile(
     r"|<= Recv header: (content-type|retry-after): *([^\r\n]*)",
     re.IGNORECASE,
 )
-# The line of one reference in the output of ``git push --porcelain``: flag, reference, what.
-_PORCELAIN = re.compile(r"^(.)\t[^\t\n]*:([^\t\n:]+)\t(\[.*?\])?(?: \((.*)\))?", re.MULTILINE)
+# A line of ``git push --porcelain``: a reference, and what came of it.
+_PORCELAIN = re.compile(r"^.\t[^\t\n]*:([^\t\n:]+)\t(\[.*?\])?(?: \((.*)\))?", re.MULTILINE)
 # What git says after any failure; it hides what the server has said.
 _SAYS_NOTHING = re.compile(
     r"fatal: Could not read from remote repository|fatal: the remote end hung up|"
@@ -91,10 +91,12 @@ class GitResult:
 
     def line_of(self, reference: str) -> tuple[str, str]:
         """Return what git says of a pushed reference: ``[remote rejected]``, and the reason."""
-        for flag, name, what, reason in _PORCELAIN.findall(self.out):
-            if flag == "!" and name == reference:
-                return what, reason
-        return "", ""
+        lines = (line[1:] for line in _PORCELAIN.findall(self.out) if line[0] == reference)
+        return next(lines, ("", ""))
+
+    def took(self, reference: str) -> bool:
+        # not if the server did something else with the push, such as opening a merge request
+        return not self.code and any(line[0] == reference for line in _PORCELAIN.findall(self.out))
 
     def is_verdict(self, reference: str) -> bool:
         """Whether the server has answered that it does not take the reference."""
@@ -105,7 +107,7 @@ class GitResult:
     def is_page(self) -> bool:
         """Whether a login or a captive portal has answered, and not a Git server."""
         status, kind, _ = self._answer()
-        return status == 200 and kind.startswith("text/html")
+        return status == 200 and bool(kind) and not kind.startswith("application/x-git")
 
     @property
     def is_absence(self) -> bool:
@@ -154,10 +156,6 @@ _REMEDIES = tuple(
     for pattern, remedy in (
         ("no space left on device", "free some room on the disk of the clone, or of the server"),
         (
-            "resolve host|name or service not known",
-            "check the host in the address, and the network",
-        ),
-        (
             r"error: 40[13]|permission denied|access denied|authentication failed|"
             r"could not read (username|password)|host key verification failed",
             "git needs credentials for this address: a credential helper, ~/.netrc or an SSH key",
@@ -176,7 +174,7 @@ _REMEDIES = tuple(
             "repository's files",
         ),
         (
-            "refused|timed out|unreachable|couldn't connect",
+            "resolve host|name or service not known|refused|timed out|unreachable|couldn't connect",
             "check the host and the port in the address, and the network",
         ),
     )
@@ -313,7 +311,7 @@ class RemoteRepository(repositories.StateRepository):
                 pushed = self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except (pygit2.GitError, OSError) as error:
             raise repositories.access_error(error, f"the clone {self._folder}") from None
-        if pushed.code:
+        if not pushed.took(MAIN):
             if pushed.line_of(MAIN)[0] == "[rejected]":  # git sent nothing
                 return False
             tip = self.refresh()
@@ -401,7 +399,6 @@ class RemoteRepository(repositories.StateRepository):
     ) -> GitResult:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
-        slow = SlowGit(f"{_DOING.get(command[0], 'asking')} {self.address}")
         with tempfile.NamedTemporaryFile("r", prefix="demandops-", errors="replace") as http:
             trace = {"GIT_TRACE_CURL": http.name, "GIT_TRACE_CURL_NO_DATA": "1"}
             process = subprocess.Popen(
@@ -416,24 +413,28 @@ class RemoteRepository(repositories.StateRepository):
             self._process = process
             if self._aborted:  # another thread has called abort since the first check
                 self.abort()
-            start = REAL.monotonic()
+            start, told = REAL.monotonic(), 0
             try:
                 while True:
                     with suppress(subprocess.TimeoutExpired):
                         out, err = process.communicate(timeout=_POLL_S)
                         break
-                    slow.lasts(REAL.monotonic() - start)
+                    took = REAL.monotonic() - start
+                    if int(took) > told:
+                        told, doing = int(took), _DOING.get(command[0], "asking")
+                        slow_git.tell(f"{doing} {self.address}, {told} s")
                     self.while_waiting()
                     if urgent():
                         raise FetchInterrupted("the fetch was interrupted by a demand")
-                    if REAL.monotonic() - start >= timeout:
+                    if took >= timeout:
                         out, err = _terminate(process)
                         break
             finally:
                 if process.returncode is None:
                     _terminate(process)
                 self._process = None
-                slow.ends()
+                if told:
+                    slow_git.tell("")
             texts = [text.decode("utf-8", "replace") for text in (out, err)]
             code, took = process.returncode, REAL.monotonic() - start
             if code < 0:

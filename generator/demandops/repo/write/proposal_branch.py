@@ -111,7 +111,7 @@ class ProposalBranches:
             return ""
         spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
         pushed = self._remote.push(spec, lease, options)
-        if not pushed.code:
+        if pushed.took(reference):
             lines = [line for line in pushed.err.splitlines() if line.startswith("remote:")]
             links = [link[0] for line in lines if (link := _LINK.search(line))]
             # GitLab prints how to make a merge request, or the one that exists
