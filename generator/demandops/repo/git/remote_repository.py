@@ -369,6 +369,8 @@ class RemoteRepository(repositories.StateRepository):
         if not self._is_usable():
             return self._unreadable()
         reason = ": ".join(filter(None, (pushed.line_of(reference)[1], pushed.words)))
+        if not pushed.code:
+            reason = f"it takes the push, but leaves {reference} where it is"
         is_verdict = pushed.is_verdict(reference)
         if not is_verdict and (pushed.is_absence or pushed.seconds > _LONGEST_REFUSAL_S):
             reason = _PAGE if pushed.is_page else reason
