@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import re
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from pygit2 import Oid, Repository
 from demandops.base.errors import StateRepoError, Unsound
 from demandops.base.quoting import quoted
 from demandops.base.settings import MAIN_BRANCH
+from demandops.repo.git import child_processes
 from demandops.repo.git import repository as repositories
 from demandops.repo.git.objects import NewObjects, sync_folder
 from demandops.repo.git.remote_repository import HAS_PASSWORD, HAS_TOKEN, Notify, RemoteRepository
@@ -66,14 +66,8 @@ class LocalRepository(StateRepository):
 
     def renew_if_damaged(self) -> bool:
         """Raise StateRepoError if git finds damage: there is no remote to clone from."""
-        checked = subprocess.run(
-            [*repositories.git(self.objects.path), "fsck", "--no-dangling", "--no-progress"],
-            env=os.environ | repositories.git_environment(),
-            capture_output=True,
-            text=True,
-            errors="replace",
-            check=False,
-        )
+        check = ("fsck", "--no-dangling", "--no-progress")
+        checked = child_processes.run_git(self.objects.path, *check)
         if checked.returncode:
             lines = [*(checked.stderr + checked.stdout).strip().splitlines(), "git fsck fails"]
             # other lines name only objects that point to the missing one

@@ -28,8 +28,8 @@ from demandops.base.errors import StateRepoError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
+from demandops.repo.git import child_processes, slow_git
 from demandops.repo.git import repository as repositories
-from demandops.repo.git import slow_git
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.repository import (
     MAIN,
@@ -404,12 +404,12 @@ class RemoteRepository(repositories.StateRepository):
         with tempfile.NamedTemporaryFile("r", prefix="demandops-", errors="replace") as http:
             trace = {"GIT_TRACE_CURL": http.name, "GIT_TRACE_CURL_NO_DATA": "1"}
             process = subprocess.Popen(
-                [*repositories.git(folder or self._folder), *command],
+                [*child_processes.git(folder or self._folder), *command],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 cwd=(folder or self._folder).parent,
-                env=os.environ | repositories.git_environment() | trace,
+                env=os.environ | child_processes.git_environment() | trace,
                 start_new_session=True,
             )
             self._process = process

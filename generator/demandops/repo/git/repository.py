@@ -24,32 +24,6 @@ from demandops.repo.git.signing import Signer
 
 MAIN = f"refs/heads/{MAIN_BRANCH}"
 TIMEOUT_S = 120
-_ENVIRONMENT = {
-    # git fails instead of asking for a password, because nobody may be there to answer
-    "GIT_TERMINAL_PROMPT": "0",
-    # git's errors are recognized by their English text
-    "LC_ALL": "C",
-    # git ends an HTTP transfer with less than 1 byte a second for 60 seconds
-    "GIT_HTTP_LOW_SPEED_LIMIT": "1",
-    "GIT_HTTP_LOW_SPEED_TIME": "60",
-}
-
-
-# Of a person's settings, those for access to the server count; those that start hooks, send more
-# or colour what is parsed do not. The repository is named, as safe.bareRepository may hide it.
-_SETTINGS = (
-    f"core.hooksPath={os.devnull}", "push.pushOption=", "color.ui=false", "gc.auto=0",
-    "maintenance.auto=false",
-)  # fmt: skip
-
-
-def git_environment() -> dict[str, str]:
-    return _ENVIRONMENT | child_processes.mark()
-
-
-def git(folder: Path | str) -> list[str]:
-    """Return how a command line begins that runs git in the bare repository ``folder``."""
-    return ["git", f"--git-dir={folder}", *(word for each in _SETTINGS for word in ("-c", each))]
 
 
 class Unavailable(StateRepoError):
@@ -247,8 +221,15 @@ class StateRepository(ABC):
         self._tidying = subprocess.Popen(
             # --geometric joins a pack only with those of about its size, so that a demand's small
             # pack does not let git write the whole history again
-            [*git(self.objects.path), "repack", "--geometric=2", "-d", "-l", "--quiet"],
-            env=os.environ | git_environment(),
+            [
+                *child_processes.git(self.objects.path),
+                "repack",
+                "--geometric=2",
+                "-d",
+                "-l",
+                "--quiet",
+            ],
+            env=os.environ | child_processes.git_environment(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # so that Ctrl-C does not end it
