@@ -266,16 +266,16 @@ class Worker:
                 for ticket in batch:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
                 patience_s = self._refusal_patience_s - self._record_failure(reason)
-                if patience_s <= 0:
-                    self._demands.fail(batch, reason)
-                    batch.clear()
-                    return
                 self._tip_is_fresh = self._repository.always_current
                 wait = self._backoff.unreachable()
                 if isinstance(reason, Unavailable):
                     wait = max(wait, reason.retry_after_s)
-                else:
+                elif patience_s > 0:
                     wait = min(wait, patience_s)
+                else:
+                    self._demands.fail(batch, reason)
+                    batch.clear()
+                    return
             if wait is None:
                 continue
             # Wait before the fetch, not after it, because the push must follow the fetch closely.
@@ -300,7 +300,7 @@ class Worker:
                 f"{reason}; the demand stays in the journal and is resumed at the next start"
             )
 
-    def _attempt(self, batch: list[Ticket]) -> float | None:  # noqa: PLR0912
+    def _attempt(self, batch: list[Ticket]) -> float | None:  # noqa: PLR0912, PLR0915
         # the seconds to wait before the next attempt, or None to continue at once
         # fetch before a demand is committed, because after that it can no longer be withdrawn
         if self._must_fetch or self.remote.status.unreachable:
@@ -320,7 +320,7 @@ class Worker:
         # search for published demands and the deletion of released branches hold only for that tip
         if commits.start.commit != tip:
             return None
-        began = self._runtime.monotonic()
+        began, has_own_work = self._runtime.monotonic(), not commits.is_empty
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
@@ -349,9 +349,11 @@ class Worker:
         except PushDenied as refusal:
             # what was decided before the batch had a commit does not depend on the push
             self._answer(results[:independent])
-            final = [ticket for ticket, _ in results[:independent]]
-            batch[:] = [ticket for ticket in part if ticket not in final] + left
-            return self._isolate([ticket for ticket, _ in results[independent:]], batch, refusal)
+            refused = [ticket for ticket, _ in results[independent:]]
+            batch[:] = [ticket for ticket in part if ticket in refused] + left
+            if has_own_work and len(refused) == 1:  # which of the two is refused?
+                refused = []
+            return self._isolate(refused, batch, refusal)
         if published:
             self._record_reached(pushed=not commits.is_empty)
             self._record_published(commits)

@@ -17,7 +17,7 @@ from demandops.base import settings
 from demandops.base.errors import StateRepoError, Unsound
 from demandops.repo import reader
 from demandops.repo.git.remote_repository import RemoteRepository
-from demandops.repo.git.repository import MAIN, DiskFull, PushDenied, disk_error
+from demandops.repo.git.repository import MAIN, PushDenied, Unavailable, disk_error
 from demandops.repo.history.commit_message import generator_signature
 from demandops.serve.generator import Generator
 
@@ -33,8 +33,8 @@ from tests.kit.rig import Person, Stages, goal
 @pytest.mark.parametrize(
     ("number", "kind"),
     [
-        (errno.ENOSPC, DiskFull),
-        (errno.EDQUOT, DiskFull),
+        (errno.ENOSPC, Unavailable),
+        (errno.EDQUOT, Unavailable),
         (errno.EACCES, PushDenied),
         (errno.EROFS, PushDenied),
         (errno.EIO, Unsound),
@@ -341,7 +341,7 @@ def test_a_full_disk_of_the_clone_is_told_at_a_push(url: str, bare: Path, tmp_pa
     before = repository.tip()
     tree, who = repository.objects[before].peel(pygit2.Tree).id, generator_signature(NOW)
     commit = repository.new.add_commit(None, (who, who), "Again\n", tree, [before])
-    with files_end_at(10), pytest.raises(DiskFull, match=r"clone\.git cannot be written"):
+    with files_end_at(10), pytest.raises(Unavailable, match=r"clone\.git cannot be written"):
         repository.publish(before, commit)
 
 

@@ -13,7 +13,8 @@ import yaml
 from demandops.repo.git.remote_repository import GitResult
 from demandops.repo.git.repository import PushDenied
 
-from tests.kit import goals, rig
+from tests.kit import config, goals, plain_yaml, rig
+from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server
 from tests.kit.rig import Person, Stages, goal
 
@@ -90,6 +91,23 @@ def test_people_may_push_while_it_is_found_out_which_commit_is_refused(
         assert [*map(rig.outcome, tickets)] == ["booked", "PushDenied", "booked"]
     assert pushed
     rig.assert_sound(bare)
+
+
+def test_own_work_that_the_server_refuses_holds_up_no_demand(
+    url: str, bare: Path, person: Person, clock: Clock, caplog: pytest.LogCaptureFixture
+) -> None:
+    head = plain_yaml.load(config.override())
+    select = [{"services": ["object-detection"]}]
+    fields = {"select": select, "replicas": 3, "expires": "2040-01-01T00:00:00Z"}
+    person.override(brief=yaml.safe_dump(head | fields))
+    with rig.running(url, runtime=clock, fetch_interval=0.1) as generator:
+        rig.book(generator, goal(1))
+        rule = 'git log --format=%B "$1..$2" | grep -q expire-override'
+        _refuse(bare, rule)
+        clock.pass_(500_000_000)
+        rig.wait_until(lambda: "rejects the push" in caplog.text, "the end of the override is due")
+        rig.book(generator, goal(2), goal(3))
+    assert len(rig.operations(bare)) == 3
 
 
 # ---- every commit is refused: the writer is ----

@@ -118,13 +118,10 @@ class GitResult:
     @property
     def retry_after_s(self) -> float:
         text = self._answer()[2]
-        with suppress(ValueError):
-            seconds = (
-                float(text)
-                if text.isdecimal()
-                else (parsedate_to_datetime(text) - REAL.now()).total_seconds()
-            )
-            return max(0.0, min(seconds, _LONGEST_RETRY_AFTER_S))
+        with suppress(ValueError, TypeError):
+            if not text.isdecimal():
+                text = str((parsedate_to_datetime(text) - REAL.now()).total_seconds())
+            return max(0.0, min(float(text), _LONGEST_RETRY_AFTER_S))
         return 0.0
 
     def _answer(self) -> tuple[int, str, str]:
@@ -150,34 +147,32 @@ class GitResult:
         return one_line(" ".join(dict.fromkeys(telling))) or "git gave no reason"
 
 
-# Pairs: a pattern that matches a reason, and the remedy for a person.
-_REMEDIES = tuple(
-    (re.compile(pattern, re.IGNORECASE), remedy)
-    for pattern, remedy in (
-        ("no space left on device", "free some room on the disk of the clone, or of the server"),
-        (
-            r"error: 40[13]|permission denied|access denied|authentication failed|"
-            r"could not read (username|password)|host key verification failed",
-            "git needs credentials for this address: a credential helper, ~/.netrc or an SSH key",
-        ),
-        (
-            "not found|error: 404|does not appear to be a git",
-            "check the path in the address, and whether you may read the repository",
-        ),
-        (
-            "detected dubious ownership",
-            "check the path in the address, and who owns the repository's files",
-        ),
-        (
-            "not our ref 0{40}",
-            "the server cannot read the branch: check the server's disk, and who may read the "
-            "repository's files",
-        ),
-        (
-            "resolve host|name or service not known|refused|timed out|unreachable|couldn't connect",
-            "check the host and the port in the address, and the network",
-        ),
-    )
+# Pairs: a pattern that matches a reason, in any case, and the remedy for a person.
+_REMEDIES = (
+    ("no space left on device", "free some room on the disk of the clone, or of the server"),
+    (
+        r"error: 40[13]|permission denied|access denied|authentication failed|"
+        r"could not read (username|password)|host key verification failed",
+        "git needs credentials for this address: a credential helper, ~/.netrc or an SSH key",
+    ),
+    (
+        "not found|error: 404|does not appear to be a git",
+        "check the path in the address, and whether you may read the repository",
+    ),
+    (
+        "detected dubious ownership",
+        "check the path in the address, and who owns the repository's files",
+    ),
+    (
+        "not our ref 0{40}",
+        "the server cannot read the branch: check the server's disk, and who may read the "
+        "repository's files",
+    ),
+    (
+        "resolve host|name or service not known|refused|timed out|unreachable|couldn't connect",
+        "check the host and the port in the address, and the network",
+    ),
+    (r"\bconfig (value|variable|line)\b", "mend that line of your settings for git"),
 )
 # Git's error if it cannot read a file, here or on the server: credentials do not mend that.
 _NO_FILE = re.compile(r"unable to access '[^':]*':.*")
@@ -382,7 +377,8 @@ class RemoteRepository(repositories.StateRepository):
             return self._unreadable()
         reason = _PAGE if read.is_page else read.words
         remediable = _NO_FILE.sub("", reason)
-        remedy = next((f"; {told}" for words, told in _REMEDIES if words.search(remediable)), "")
+        remedies = (f"; {told}" for words, told in _REMEDIES if re.search(words, remediable, re.I))
+        remedy = next(remedies, "")
         text = f"{self.address} cannot be {doing}: {reason}{remedy}"
         return RemoteAway(text, read.retry_after_s)
 

@@ -38,10 +38,6 @@ class RemoteAway(Unavailable):
     """Raised when the remote cannot be read, or nobody answers a push."""
 
 
-class DiskFull(Unavailable):
-    """Raised when the disk of the state repo, or of its clone, has no room."""
-
-
 class FetchInterrupted(StateRepoError):
     """Raised when a fetch was stopped for more urgent work, like a new demand."""
 
@@ -74,7 +70,7 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
     else:
         what = os.strerror(number)
     if number in _NO_ROOM:
-        return DiskFull(f"{address} cannot be written: its disk has no room ({what}); free some")
+        return Unavailable(f"{address} cannot be written: its disk has no room ({what}); free some")
     if number == errno.EROFS:
         return PushDenied(f"{address} cannot be written: {what}; make its file system writable")
     if number in _NOT_ALLOWED:

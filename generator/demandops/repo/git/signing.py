@@ -167,13 +167,15 @@ def _check_with_git(
     with tempfile.NamedTemporaryFile("w", prefix="demandops-") as file:
         file.write(allowed)
         file.flush()
-        output = child_processes.run_git(
+        ran = child_processes.run_git(
             repo.path,
             *_CONFIG,
             *("-c", f"gpg.ssh.allowedSignersFile={file.name}"),
             *("log", "--no-show-signature", "--no-walk=unsorted", "--stdin"),
             *("-z", "--format=%H %G? %GS"),
             stdin="\n".join(commits) + "\n",
-        ).stdout
-    rows = (row.split(" ", 2) for row in output.split("\0") if row)
+        )
+    if ran.returncode:
+        raise StateRepoError(f"git cannot check signatures: {ran.stderr}")
+    rows = (row.split(" ", 2) for row in ran.stdout.split("\0") if row)
     return {id: (state, signer) for id, state, signer in rows}
