@@ -300,7 +300,7 @@ class Worker:
                 f"{reason}; the demand stays in the journal and is resumed at the next start"
             )
 
-    def _attempt(self, batch: list[Ticket]) -> float | None:  # noqa: PLR0912, PLR0915
+    def _attempt(self, batch: list[Ticket]) -> float | None:  # noqa: PLR0912
         # the seconds to wait before the next attempt, or None to continue at once
         # fetch before a demand is committed, because after that it can no longer be withdrawn
         if self._must_fetch or self.remote.status.unreachable:
@@ -345,7 +345,7 @@ class Worker:
             if self._repository.refresh() != commits.start.commit:
                 return None
         try:
-            published = commits.publish()
+            published = self._publish_commits(commits, results)
         except PushDenied as refusal:
             # what was decided before the batch had a commit does not depend on the push
             self._answer(results[:independent])
@@ -355,10 +355,6 @@ class Worker:
                 refused = []
             return self._isolate(refused, batch, refusal)
         if published:
-            self._record_reached(pushed=not commits.is_empty)
-            self._record_published(commits)
-            self._is_writer_proven = self._is_writer_proven or not commits.is_empty
-            self._answer(results)
             batch[:] = left
             self._demands.put_back(batch, [ticket for ticket, _ in results])
             self._backoff.begin_anew()
@@ -495,6 +491,16 @@ class Worker:
             return []
         return self._agenda.leases.tickets(snapshot.state.ledger)
 
+    def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
+        # false, without answers, if another writer was first or locks main
+        if not commits.publish():
+            return False
+        self._record_reached(pushed=not commits.is_empty)
+        self._record_published(commits)
+        self._is_writer_proven = self._is_writer_proven or not commits.is_empty
+        self._answer(results)
+        return True
+
     def _answer(self, results: list[Result]) -> None:
         final = [(ticket, result) for ticket, result in results if not isinstance(result, Decision)]
         self._demands.answer(final)
@@ -546,11 +552,7 @@ class Worker:
             ]
             text = compose([[title], [why]], trailers)
             commits.commit_files({}, commits.head.state, text, generator_signature(now), now)
-        self._must_fetch = not commits.publish()
-        if not self._must_fetch:
-            self._is_writer_proven = True
-            self._record_reached(pushed=True)
-            self._record_published(commits)
+        self._must_fetch = not self._publish_commits(commits, [])
         return None
 
     # ---- following the state repo ----
