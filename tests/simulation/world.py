@@ -169,7 +169,11 @@ class Clone(RemoteRepository):
             f'[remote "origin"]\n\turl = {self._url}\n'
         )
         partial.joinpath("objects").symlink_to(Path(self._machine.world.remote.path) / "objects")
-        self._fetch(folder=partial)
+        folder, self._folder = self._folder, partial
+        try:
+            self._fetch()
+        finally:
+            self._folder = folder
         partial.rename(self._folder)
 
     def _run_git(
@@ -177,7 +181,6 @@ class Clone(RemoteRepository):
         *command: str,
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = 0,
-        folder: Path | None = None,
     ) -> GitResult:
         machine, verb = self._machine, command[0]
         self._wait(urgent, machine.delay)
@@ -189,8 +192,7 @@ class Clone(RemoteRepository):
         if verb == "fsck":
             return GitResult(0, "", "")
         machine.may_crash()
-        folder = folder or self._folder
-        result = getattr(self, f"_{verb.replace('-', '_')}_there")(folder, *command[1:])
+        result = getattr(self, f"_{verb.replace('-', '_')}_there")(*command[1:])
         machine.may_crash()
         self._wait(urgent, machine.delay)
         if machine.losses:
@@ -208,9 +210,9 @@ class Clone(RemoteRepository):
             if left <= 0:
                 return
 
-    def _fetch_there(self, folder: Path, *arguments: str) -> GitResult:
+    def _fetch_there(self, *arguments: str) -> GitResult:
         source, target = arguments[-1].removeprefix("+").split(":")
-        file = folder / target
+        file = self._folder / target
         tip = b"%s\n" % str(self._machine.world.remote.references[source].target).encode()
         with suppress(FileNotFoundError):
             if file.read_bytes() == tip:
@@ -219,14 +221,14 @@ class Clone(RemoteRepository):
         file.write_bytes(tip)
         return GitResult(0, "", "")
 
-    def _ls_remote_there(self, folder: Path, *arguments: str) -> GitResult:
+    def _ls_remote_there(self, *arguments: str) -> GitResult:
         references = self._machine.world.remote.references
         wanted = [each.rstrip("*") for each in arguments[2:]]
         found = [name for name in references if any(name.startswith(each) for each in wanted)]
         lines = (f"{references[name].target}\t{name}" for name in sorted(found))
         return GitResult(0, "\n".join(lines), "")
 
-    def _push_there(self, folder: Path, *arguments: str) -> GitResult:
+    def _push_there(self, *arguments: str) -> GitResult:
         references = self._machine.world.remote.references
         (lease,) = [each for each in arguments if each.startswith("--force-with-lease=")]
         reference, _, expected = lease.partition("=")[2].partition(":")

@@ -191,7 +191,7 @@ _AMBIGUOUS = re.compile(r"^error: dst refspec \S+ matches more than one", re.MUL
 # SSH, ``url.*.insteadOf``.
 _FETCH = (
     "fetch", "--no-tags", "--no-recurse-submodules", "--no-auto-maintenance",
-    "--no-write-fetch-head", "--no-write-commit-graph",
+    "--no-write-fetch-head", "--no-write-commit-graph", "--quiet",
 )  # fmt: skip
 _PUSH = (
     "push", "--porcelain", "--no-verify", "--no-signed", "--no-follow-tags",
@@ -257,43 +257,44 @@ class RemoteRepository(repositories.StateRepository):
 
     def _clone(self, notify: Notify) -> None:
         notify(f"cloning {self.address}")
-        self._folder.parent.mkdir(parents=True, exist_ok=True)
+        folder = self._folder
+        folder.parent.mkdir(parents=True, exist_ok=True)
         # a killed process must not leave half a clone under the final name
-        partial = self._folder.with_name(self._folder.name + ".partial")
-        shutil.rmtree(partial, ignore_errors=True)
-        # by libgit2, which copies no hooks and settings from a person's template
-        config = pygit2.init_repository(str(partial), bare=True, initial_head=MAIN_BRANCH).config
-        config["remote.origin.url"] = self._url
-        config["gc.auto"] = 0  # tidy joins the packs, not a fetch
-        # Keep each fetched pack, because git syncs packs. Loose objects may be half-written after a
-        # crash, and libgit2 hangs on them.
-        config["fetch.unpackLimit"] = 1
-        partial.joinpath("config").chmod(0o600)
-        self._fetch(folder=partial, timeout=_CLONE_TIMEOUT_S)
-        if self._folder.exists():
-            shutil.rmtree(self._folder)
-        partial.rename(self._folder)
+        self._folder = folder.with_name(f"{folder.name}.partial")
+        try:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            # by libgit2, which copies no hooks and settings from a person's template
+            made = pygit2.init_repository(str(self._folder), bare=True, initial_head=MAIN_BRANCH)
+            made.config["remote.origin.url"] = self._url
+            made.config["gc.auto"] = 0  # tidy joins the packs, not a fetch
+            # Keep each fetched pack, because git syncs packs. Loose objects may be half-written
+            # after a crash, and libgit2 hangs on them.
+            made.config["fetch.unpackLimit"] = 1
+            (self._folder / "config").chmod(0o600)
+            self._fetch(timeout=_CLONE_TIMEOUT_S)
+            if folder.exists():
+                shutil.rmtree(folder)
+            self._folder.rename(folder)
+        finally:
+            self._folder = folder
 
     def _fetch(
         self,
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = repositories.TIMEOUT_S,
-        folder: Path | None = None,
     ) -> None:
         # The refspec is not in git's configuration. If it were, a push that outlives its generator
         # would move the reference.
-        spec = f"+{MAIN}:{_REMOTE_MAIN}"
-        command = (*_FETCH, "--no-prune", "--quiet", self._url, spec)
-        fetched = self._run_git(*command, urgent=urgent, timeout=timeout, folder=folder)
+        command = (*_FETCH, "--no-prune", self._url, f"+{MAIN}:{_REMOTE_MAIN}")
+        fetched = self._run_git(*command, urgent=urgent, timeout=timeout)
         if not fetched.code:
             return
-        error = self._read_error("fetched", fetched, folder)
         if not fetched.is_absence:  # by its exit code, ls-remote tells that there is no such branch
             listing = ("ls-remote", "--quiet", "--exit-code", self._url, MAIN)
-            listed = self._run_git(*listing, urgent=urgent, folder=folder)
+            listed = self._run_git(*listing, urgent=urgent)
             if listed.code == 2 and not listed.is_page:
                 raise repositories.missing_main(self.address)
-        raise error
+        raise self._read_error("fetched", fetched)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         self._fetch(urgent)
@@ -333,7 +334,7 @@ class RemoteRepository(repositories.StateRepository):
     def fetch_branches(self, prefix: str) -> None:
         # what the remote has deleted, this clone deletes too
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
-        fetched = self._run_git(*_FETCH, "--prune", "--quiet", self._url, spec)
+        fetched = self._run_git(*_FETCH, "--prune", self._url, spec)
         if fetched.code:
             raise self._read_error("fetched", fetched)
 
@@ -361,26 +362,27 @@ class RemoteRepository(repositories.StateRepository):
 
     def push_error(self, pushed: GitResult, reference: str) -> StateRepoError:
         """Return PushDenied if the remote, which can be read, refused a push; else Unavailable."""
-        if not self._is_usable():
-            return self._unreadable()
+        is_verdict = pushed.is_verdict(reference)
+        is_away = pushed.is_absence or pushed.seconds > _LONGEST_REFUSAL_S
+        if not self._is_readable or (is_away and not is_verdict):
+            return self._read_error("pushed to", pushed)
         reason = ": ".join(filter(None, (pushed.line_of(reference)[1], pushed.words)))
         if not pushed.code:
             reason = f"it takes the push, but leaves {reference} where it is"
-        is_verdict = pushed.is_verdict(reference)
-        if not is_verdict and (pushed.is_absence or pushed.seconds > _LONGEST_REFUSAL_S):
-            reason = _PAGE if pushed.is_page else reason
-            return RemoteAway(f"{self.address} cannot be pushed to: {reason}", pushed.retry_after_s)
         return PushDenied(f"{self.address} rejects the push: {reason}", is_verdict=is_verdict)
 
-    def _read_error(self, doing: str, read: GitResult, folder: Path | None = None) -> Unavailable:
-        if folder is None and not self._is_usable():
+    def _read_error(self, doing: str, read: GitResult) -> Unavailable:
+        if not self._is_readable:
             return self._unreadable()
         reason = _PAGE if read.is_page else read.words
         remediable = _NO_FILE.sub("", reason)
         remedies = (f"; {told}" for words, told in _REMEDIES if re.search(words, remediable, re.I))
-        remedy = next(remedies, "")
-        text = f"{self.address} cannot be {doing}: {reason}{remedy}"
+        text = f"{self.address} cannot be {doing}: {reason}{next(remedies, '')}"
         return RemoteAway(text, read.retry_after_s)
+
+    @property
+    def _is_readable(self) -> bool:
+        return (self._folder / "HEAD").is_file()
 
     def _unreadable(self) -> Unavailable:
         return Unavailable(
@@ -393,18 +395,17 @@ class RemoteRepository(repositories.StateRepository):
         *command: str,
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = repositories.TIMEOUT_S,
-        folder: Path | None = None,
     ) -> GitResult:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
         with tempfile.NamedTemporaryFile("r", prefix="demandops-", errors="replace") as http:
             trace = {"GIT_TRACE_CURL": http.name, "GIT_TRACE_CURL_NO_DATA": "1"}
             process = subprocess.Popen(
-                [*child_processes.git(folder or self._folder), *command],
+                [*child_processes.git(self._folder), *command],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                cwd=(folder or self._folder).parent,
+                cwd=self._folder.parent,
                 env=os.environ | child_processes.git_environment() | trace,
                 start_new_session=True,
             )
@@ -436,11 +437,8 @@ class RemoteRepository(repositories.StateRepository):
             texts = [text.decode("utf-8", "replace") for text in (out, err)]
             code, took = process.returncode, REAL.monotonic() - start
             if code < 0:
-                ended = (
-                    f"timed out after {timeout:g} s"
-                    if took >= timeout
-                    else f"was ended by signal {-code}"
-                )
+                ended = f"was ended by signal {-code}"
+                ended = f"timed out after {timeout:g} s" if took >= timeout else ended
                 texts[1] += f"\nfatal: git {ended}"
             return GitResult(code, texts[0], texts[1], http.read(), took)
 
