@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 from demandops.repo.git.remote_repository import GitResult
-from demandops.repo.git.repository import PushDenied
+from demandops.repo.git.repository import MAIN, PushDenied
 
 from tests.kit import config, goals, plain_yaml, rig
 from tests.kit.clock import Clock
@@ -197,8 +197,30 @@ def test_a_rate_limit_is_an_absence_that_says_how_long_it_lasts(after: str, seco
     sent = "12:00:00.1 http.c:684 => Send header: GET /s.git/info/refs HTTP/2\n"
     http = f"{sent}<= Recv header: HTTP/2 429\n<= Recv header: {after}\n"
     limited = GitResult(128, "", "fatal: error: 429", http)
-    assert limited.is_absence and not limited.is_verdict("refs/heads/main")
+    assert limited.is_absence and not limited.is_verdict(MAIN)
     assert limited.retry_after_s == seconds
+
+
+@pytest.mark.parametrize(
+    ("line", "took", "told"),
+    [
+        (" \t1f:refs/heads/main\ta1..1f", True, ("", "")),
+        ("*\t1f:refs/pull/7/head\t[new reference]", False, ("", "")),  # a merge request instead
+        ("!\t1f:refs/heads/main\t[rejected] (stale info)", False, ("[rejected]", "stale info")),
+        (
+            "!\t1f:refs/heads/main\t[remote rejected] (no (not now))",
+            False,
+            ("[remote rejected]", "no (not now)"),
+        ),
+    ],
+)
+def test_what_came_of_a_push_is_read_from_the_line_of_its_branch(
+    line: str, took: bool, told: tuple[str, str]
+) -> None:
+    result = GitResult(int(line[0] == "!"), f"To there\n{line}\nDone\n", "")
+    assert result.took(MAIN) is took
+    assert result.line_of(MAIN) == told
+    assert result.is_verdict(MAIN) is (told[0] == "[remote rejected]")
 
 
 # ---- a person's settings for git ----
