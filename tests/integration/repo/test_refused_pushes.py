@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from hashlib import sha256
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 import yaml
 from demandops.repo.git.remote_repository import GitResult
 from demandops.repo.git.repository import MAIN, PushDenied
+from demandops.serve.approvals import approvals
 
 from tests.kit import config, goals, plain_yaml, rig
 from tests.kit.clock import Clock
@@ -170,6 +172,29 @@ def test_while_the_writer_is_refused_demands_wait_and_the_status_says_so(
         assert not generator.remote_status.push_denied
     assert caplog.text.count("the key is read-only") == 1
     rig.assert_sound(bare)
+
+
+@pytest.mark.parametrize("patience", [0.2, 60.0])
+def test_a_proposal_that_the_server_does_not_take_waits_for_a_bounded_time(
+    ssh: Path, bare: Path, petra: Person, monkeypatch: pytest.MonkeyPatch, patience: float
+) -> None:
+    monkeypatch.setattr(approvals, "_REFUSAL_PATIENCE_S", patience)
+    monkeypatch.setenv("SAYS", "ERROR: the key is read-only")
+    ssh.with_name("ssh.open").touch()  # what Petra changed is rendered
+    with rig.running(f"ssh://git@forge{bare}", fetch_interval=0.1) as generator:
+        generator.fetch_now()
+        rig.wait_until(lambda: not generator.snapshot.problems, "the policy is in effect")
+        ssh.with_name("ssh.open").unlink()
+        stages = Stages()
+        ticket = generator.submit(goal(1), listener=stages)
+        if patience < 1:
+            with pytest.raises(PushDenied, match="the key is read-only"):
+                rig.receipt(ticket)
+        else:
+            time.sleep(0.5)
+            assert not ticket.future.done()
+            ssh.with_name("ssh.open").touch()
+            rig.wait_until(lambda: "proposed" in stages.names, "it awaits approval")
 
 
 # ---- nobody is refused ----
