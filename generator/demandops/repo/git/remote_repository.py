@@ -324,7 +324,6 @@ class RemoteRepository(repositories.StateRepository):
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
-        # name → commit; the patterns are those of ``git ls-remote``
         listed = self._run_git("ls-remote", "--quiet", self._url, *patterns)
         if listed.code or listed.is_page:
             raise self._read_error("read", listed)

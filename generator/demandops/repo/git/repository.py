@@ -9,6 +9,7 @@ import subprocess
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pygit2
@@ -150,6 +151,14 @@ class StateRepository(ABC):
         target = self.objects.references[self.main_reference].target
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target
+
+    def list_references(self, *patterns: str) -> dict[str, str]:
+        # name → commit; the patterns are those of ``git ls-remote``
+        repo = Repository(self.objects.path)
+        names = (n for n in repo.references if any(fnmatchcase(n, pattern) for pattern in patterns))
+        # another process may delete a branch meanwhile, so a name may have no reference
+        pairs = ((name, repo.references.get(name)) for name in names)
+        return {name: str(reference.target) for name, reference in pairs if reference is not None}
 
     @abstractmethod
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:

@@ -59,23 +59,14 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        if self._remote is None:
-            repo = Repository(self._repository.objects.path)
-            names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
-            # another process may delete a branch meanwhile, so a name may have no reference
-            pairs = ((name, repo.references.get(name)) for name in [MAIN, *names])
-            commits = {name: str(ref.target) for name, ref in pairs if ref is not None}
-        else:
-            commits = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
+        commits = self._repository.list_references(MAIN, f"{_HEADS}{PREFIX}*")
         heads = {name.removeprefix(_HEADS): commit for name, commit in commits.items()}
         return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
 
     def exists(self, branch: str) -> bool:
         # any branch, also one that does not begin with ``demand/``
         reference = f"{_HEADS}{branch}"
-        if self._remote is None:
-            return reference in self._repository.objects.references
-        return reference in self._remote.list_references(reference)
+        return reference in self._repository.list_references(reference)
 
     def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
         """Make a branch point to ``commit``, durably, and return the link that the server printed.
