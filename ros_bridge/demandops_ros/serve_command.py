@@ -147,7 +147,13 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
         if web:
             # the page fetches the state repo on its own, and after each publication
             interval = parse_interval(settings["fetch_interval"])
-            follower = Follower(Reader.of(settings["state_repo"]), clusters, interval)
+            reader = Reader.of(settings["state_repo"])
+            follower = Follower(
+                reader,
+                clusters,
+                interval,
+                push_denied=lambda: generator.remote_status.push_denied,
+            )
             generator.on_publish(lambda config: follower.wake())
             page = WebServer(web, "--web", follower)
             parts.callback(page.close)
@@ -159,7 +165,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
             # lead only once the journal's demands are published, or cannot be published now
             leadership = Leadership(
                 leader_lease,
-                lambda: not generator.unpublished or bool(generator.remote_status.unreachable),
+                lambda: not generator.unpublished or bool(generator.remote_status.blocked),
                 signals.wake,
             )
             parts.callback(leadership.close)

@@ -3,7 +3,7 @@
 program=${0##*/}
 command=${program#git-}
 if [ "$program" = git ]; then
-  for command in "$@"; do case $command in -*) ;; *) break ;; esac; done
+  for command in "$@"; do case $command in -* | *=*) ;; *) break ;; esac; done
 fi
 if [ -n "$FAULTS_AT" ]; then
   number=1

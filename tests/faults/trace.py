@@ -128,7 +128,7 @@ def _whole_lines(
 
 def _program(arguments: str, before: str) -> str:
     words = [_decoded(word).decode() for word in _TEXT.findall(arguments.partition("[")[2])]
-    names = [word for word in words if not word.startswith("-")]
+    names = [word for word in words if not (word.startswith("-") or "=" in word)]
     name = names[0].rsplit("/", 1)[-1] if names else "?"
     if name == "git" and len(names) > 1:
         name = f"git {names[1]}"

@@ -21,7 +21,7 @@ from demandops.repo.merge_check.rendered_charts import RenderedCharts
 
 from tests.kit.cli import Run
 from tests.kit.goals import EXPERIMENT
-from tests.kit.repo import git
+from tests.kit.repo import GitRepo, git
 
 GOLDEN = Path(__file__).with_name("pull-request.md")
 EDGE = "clusters/c-its/perception/edge"

@@ -23,6 +23,10 @@ class Faults:
     pushes_to_refuse: int = 0
     """How many of the next pushes to refuse with ``status``."""
     status: int = 503
+    largest_push: int = 1 << 40
+    """Refuse larger pushes with 413, as a proxy in front of the server does."""
+    page: bool = False
+    """Answer every request with a page of HTML, as a login does."""
     cut_answers: int = 0
     """How many of the next pushes to carry out without an answer."""
     away_after_cut: bool = False
@@ -77,10 +81,18 @@ class _Handler(githttp.Handler):
         with _LOCK:
             no_push = bool((push or about_to) and faults.pushes_to_refuse and not faults.away)
             refuse = 503 if faults.away else faults.status if no_push else 0
+            if push and len(self._received) > faults.largest_push:
+                refuse = 413
             faults.pushes_to_refuse -= no_push
             server.refused += bool(refuse)
         if refuse:
             self.send_error(refuse)
+            return
+        if faults.page:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(b"<html><title>Sign in</title></html>")
             return
         to_client, self.wfile = self.wfile, io.BytesIO()
         self.run_backend(path, query)

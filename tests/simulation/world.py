@@ -17,11 +17,10 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-import git
 import pygit2
 from demandops.base.errors import DemandOpsError, StateRepoError
 from demandops.base.runtime import Runtime
-from demandops.repo.git.remote_repository import RemoteRepository
+from demandops.repo.git.remote_repository import GitResult, RemoteRepository
 from demandops.repo.git.repository import MAIN, FetchInterrupted
 from demandops.serve import generator
 from demandops.serve.generator import Generator
@@ -170,34 +169,36 @@ class Clone(RemoteRepository):
             f'[remote "origin"]\n\turl = {self._url}\n'
         )
         partial.joinpath("objects").symlink_to(Path(self._machine.world.remote.path) / "objects")
-        with git.Repo(partial) as repo:
-            self._fetch(repo)
+        folder, self._folder = self._folder, partial
+        try:
+            self._fetch()
+        finally:
+            self._folder = folder
         partial.rename(self._folder)
 
     def _run_git(
         self,
-        repo: git.Repo,
         *command: str,
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = 0,
-    ) -> tuple[str, str]:
+    ) -> GitResult:
         machine, verb = self._machine, command[0]
         self._wait(urgent, machine.delay)
         if self._aborted or machine.is_cut_off:
-            raise _failed(command, "fatal: unable to access the remote: Connection refused")
+            return _failed("fatal: unable to access the remote: Connection refused")
         if verb == "push" and machine.rejections:
             machine.rejections, machine.has_rejected = machine.rejections - 1, True
-            raise _failed(command, "! [remote rejected] (pre-receive hook declined)")
+            return _pushed(command, "[remote rejected] (pre-receive hook declined)")
         if verb == "fsck":
-            return "", ""
+            return GitResult(0, "", "")
         machine.may_crash()
-        out = getattr(self, f"_{verb.replace('-', '_')}_there")(repo, *command[1:])
+        result = getattr(self, f"_{verb.replace('-', '_')}_there")(*command[1:])
         machine.may_crash()
         self._wait(urgent, machine.delay)
         if machine.losses:
             machine.losses -= 1
-            raise _failed(command, "fatal: the remote end hung up unexpectedly")
-        return out, ""
+            return _failed("fatal: the remote end hung up unexpectedly")
+        return result
 
     def _wait(self, urgent: Callable[[], bool], seconds: float) -> None:
         end = self._machine.monotonic() + seconds
@@ -209,34 +210,35 @@ class Clone(RemoteRepository):
             if left <= 0:
                 return
 
-    def _fetch_there(self, repo: git.Repo, *arguments: str) -> str:
+    def _fetch_there(self, *arguments: str) -> GitResult:
         source, target = arguments[-1].removeprefix("+").split(":")
-        file = Path(repo.git_dir, target)
+        file = self._folder / target
         tip = b"%s\n" % str(self._machine.world.remote.references[source].target).encode()
         with suppress(FileNotFoundError):
             if file.read_bytes() == tip:
-                return ""
+                return GitResult(0, "", "")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(tip)
-        return ""
+        return GitResult(0, "", "")
 
-    def _ls_remote_there(self, repo: git.Repo, *arguments: str) -> str:
+    def _ls_remote_there(self, *arguments: str) -> GitResult:
         references = self._machine.world.remote.references
         wanted = [each.rstrip("*") for each in arguments[2:]]
         found = [name for name in references if any(name.startswith(each) for each in wanted)]
-        return "\n".join(f"{references[name].target}\t{name}" for name in sorted(found))
+        lines = (f"{references[name].target}\t{name}" for name in sorted(found))
+        return GitResult(0, "\n".join(lines), "")
 
-    def _push_there(self, repo: git.Repo, *arguments: str) -> str:
+    def _push_there(self, *arguments: str) -> GitResult:
         references = self._machine.world.remote.references
         (lease,) = [each for each in arguments if each.startswith("--force-with-lease=")]
         reference, _, expected = lease.partition("=")[2].partition(":")
         commit = arguments[-1].split(":")[0]
         now = str(references[reference].target) if reference in references else ""
         if now != expected:
-            raise _failed(arguments, f"! [rejected] {reference} (stale info)")
+            return _pushed(arguments, "[rejected] (stale info)")
         if not commit:
             references.delete(reference)
-            return ""
+            return _pushed(arguments, "[deleted]", 0)
         if reference == MAIN:
             if not self._machine.world.remote.descendant_of(commit, now):
                 self._machine.world.failure = AssertionError("history was rewritten")
@@ -247,11 +249,15 @@ class Clone(RemoteRepository):
             )
         references.create(reference, commit, force=True)
         self._machine.world.on_push()
-        return ""
+        return _pushed(arguments, f"{now}..{commit}", 0)
 
 
-def _failed(command: tuple[str, ...], text: str) -> git.GitCommandError:
-    return git.GitCommandError(list(command), 128, text.encode())
+def _failed(text: str) -> GitResult:
+    return GitResult(128, "", text)
+
+
+def _pushed(command: tuple[str, ...], what: str, code: int = 1) -> GitResult:
+    return GitResult(code, f"{'!' if code else ' '}\t{command[-1]}\t{what}\n", "")
 
 
 class World:

@@ -22,5 +22,5 @@ def test_the_process_with_limits_starts_without_what_is_slow_or_to_be_kept() -> 
     loaded = "import demandops.templating.child, sys; print(*sys.modules)"
     command = [sys.executable, "-c", loaded]
     names = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
-    others = ("pydantic", "pygit2", "git", "kubernetes", "demandops.model", "demandops.repo")
+    others = ("pydantic", "pygit2", "kubernetes", "demandops.model", "demandops.repo")
     assert {*others, "demandops.base.runtime"}.isdisjoint(names)

@@ -95,7 +95,7 @@ def load(name: str) -> click.Command:
         raise click.ClickException(
             f"{name} needs {missing}, which is not installed; {remedy}"
         ) from None
-    except ImportError:  # raised by GitPython
+    except ImportError:
         if shutil.which("git"):
             raise
         raise click.ClickException(

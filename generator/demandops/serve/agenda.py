@@ -154,14 +154,15 @@ class Agenda:
     def fetch_begins(self) -> None:
         self._requested.clear()  # before the fetch: a later push needs another one
 
-    def fetched(self, *, reached: bool) -> None:
+    def fetched(self, *, reached: bool, at_least_s: float = 0.0) -> None:
         """Plan the next fetch after a fetch or a push, which both tell of others' commits."""
         self._fetched_at = self._runtime.monotonic()
         if self._interval:
             longest = max(60.0, self._interval)
             self._pause = self._interval if reached else min(self._pause * 2, longest)
             # a little less at random, so that generators do not fetch all at once
-            self._fetch_at = self._fetched_at + self._pause * self._runtime.uniform(0.8, 1.0)
+            pause = max(self._pause * self._runtime.uniform(0.8, 1.0), at_least_s)
+            self._fetch_at = self._fetched_at + pause
 
     # ---- checks of the proposals ----
 

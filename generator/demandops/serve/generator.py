@@ -31,6 +31,9 @@ log = logging.getLogger("demandops")
 _STOP_TIMEOUT_S = 5.0
 # How much longer a stop waits for the threads; a running call of git or ssh-keygen ends in it.
 _GRACE_S = 5.0
+# How long demands wait while the server takes no commit at all, as with a read-only key or a branch
+# that is protected: somebody may be about to mend that. Then they are answered.
+_REFUSAL_PATIENCE_S = 120.0
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 _UNREAD = Demand("put")  # of a ticket whose goal cannot be read
 
@@ -53,6 +56,7 @@ class Generator:
         # repository on this disk is checked each second, with 0 each minute.
         fetch_interval: float = 0.0,
         signing_key: Path | None = None,
+        refusal_patience_s: float = _REFUSAL_PATIENCE_S,
         progress: Progress = lambda done, total: None,
         runtime: Runtime = REAL,
     ) -> None:
@@ -95,6 +99,7 @@ class Generator:
             Approvals(repository, snapshot.state, self._demands, with_targets, token_file),
             fetch_interval,
             heartbeat,
+            refusal_patience_s,
         )
         self.fetch_now, self.withdraw = self._worker.fetch_now, self._demands.withdraw
         self.includes, self.unchanged = repository.includes, repository.unchanged

@@ -20,7 +20,7 @@ from demandops.base.errors import (
     internal,
 )
 from demandops.base.runtime import Runtime
-from demandops.base.settings import MAIN_BRANCH
+from demandops.base.settings import MAIN_BRANCH, RENDER_VERSION
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.decide.rollback import Restoration
 from demandops.model.config.config import Config
@@ -36,6 +36,7 @@ from demandops.repo.git.repository import (
 )
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history.commit_log import operations_since
+from demandops.repo.history.commit_message import compose, generator_signature
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.ledger_files import restoration
 from demandops.repo.load.snapshot import Snapshot
@@ -64,10 +65,14 @@ log = logging.getLogger("demandops")
 @dataclass(frozen=True, slots=True)
 class RemoteStatus:
     unreachable: str = ""  # why the remote cannot be read or written now
-    push_denied: str = ""  # why the remote rejected the last push
+    push_denied: str = ""  # why the remote, which can be read, takes no push
     unreachable_since: datetime | None = None
     last_reached: datetime | None = None
     last_push: datetime | None = None
+
+    @property
+    def blocked(self) -> str:
+        return self.unreachable or self.push_denied
 
 
 class RemoteMonitor:
@@ -75,7 +80,7 @@ class RemoteMonitor:
     def __init__(self, address: str, runtime: Runtime) -> None:
         self._address, self._runtime = address, runtime
         self.status = RemoteStatus()
-        self._away_from = 0.0
+        self._away_from = self._denied_from = 0.0
 
     def record_unreachable(self, reason: str) -> None:
         since = self.status.unreachable_since
@@ -98,11 +103,17 @@ class RemoteMonitor:
             last_push=now if pushed else before.last_push,
         )
 
-    def record_push_denied(self, reason: str) -> None:
-        if reason != self.status.push_denied:
+    def record_push_denied(self, reason: str) -> float:
+        # returns for how many seconds all pushes are denied
+        now = self._runtime.monotonic()
+        if self.status.push_denied:
+            log.debug("%s", reason)
+        else:
+            self._denied_from = now
             log.error("%s", reason)
         self.record_reached()
         self.status = replace(self.status, push_denied=reason)
+        return now - self._denied_from
 
 
 # ---- the worker ----
@@ -118,6 +129,10 @@ _TRIES = 5
 # How many times the duration of a judgement passes before a configuration that is not in effect is
 # judged again because claims have ended: each renders all releases.
 _JUDGING_PAUSE_FACTOR = 20
+# How often a demand's commit must be refused alone, while another commit is accepted in between,
+# before it counts as refused: with a verdict of the server, and without one, as the connection may
+# have failed.
+_REFUSALS, _REFUSALS_WITHOUT_VERDICT = 2, 6
 _NAME = "writer"  # the thread's name, under which a health check reports its failure
 
 
@@ -132,6 +147,7 @@ class Worker:
         approvals: Approvals,
         fetch_interval: float,
         heartbeat: Callable[[], object],
+        refusal_patience_s: float,
     ) -> None:
         self.snapshot = snapshot
         self.listeners: list[Callable[[Config], None]] = []
@@ -144,6 +160,12 @@ class Worker:
         self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
         self._backoff = Backoff(self._batch_limit, self._runtime)
         self._must_fetch = self._tip_is_fresh = False
+        self._refusal_patience_s = refusal_patience_s
+        # the demand whose commit was refused alone, how often, and whether another was accepted
+        self._suspect: Demand | None = None
+        self._refusals, self._is_writer_proven = 0, False
+        # after a refusal, own work that is due is left out, as it may be what is refused
+        self._leaves_due_work = False
         self._packs_since_tidy = 0
         self._logged: tuple[errors.Fault, ...] = ()
         self._must_judge, self._judge_at = False, 0.0
@@ -244,6 +266,7 @@ class Worker:
         # also the demands that arrive during retries, and the ends of leases; the batch is empty
         # afterwards, unless an error is raised
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
+        self._suspect, self._leaves_due_work = None, False
         self._backoff.begin_anew()
         while batch or self._ended_leases(self.snapshot):
             self._heartbeat()
@@ -252,25 +275,31 @@ class Worker:
                 wait = self._attempt(batch)
             except Exception as failure:
                 reason = access_error(failure, self._repository.address, self._repository.objects)
-                if isinstance(reason, PushDenied):
-                    self.remote.record_push_denied(str(reason))
-                if not isinstance(reason, Unavailable):
+                if not isinstance(reason, Unavailable | PushDenied):
                     raise reason from None
                 # the connection may have ended after the remote accepted the push
                 for ticket in batch:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
-                self._record_unreachable(reason)
+                patience_s = self._refusal_patience_s - self._record_failure(reason)
                 self._tip_is_fresh = self._repository.always_current
                 wait = self._backoff.unreachable()
+                if isinstance(reason, Unavailable):
+                    wait = max(wait, reason.retry_after_s)
+                elif patience_s > 0:
+                    wait = min(wait, patience_s)
+                else:
+                    self._demands.fail(batch, reason)
+                    batch.clear()
+                    return
             if wait is None:
                 continue
             # Wait before the fetch, not after it, because the push must follow the fetch closely.
             # Meanwhile answer withdrawn demands, and tell the others what they wait for.
             end, to_notify = self._runtime.monotonic() + wait, list(batch)
             while not self._ends_soon.is_set():
-                unreachable = self.remote.status.unreachable
-                for ticket in to_notify if unreachable else ():
-                    ticket.notify("away", f"waiting: {unreachable}")
+                blocked = self.remote.status.blocked
+                for ticket in to_notify if blocked else ():
+                    ticket.notify("away", f"waiting: {blocked}")
                 self._demands.answer_withdrawn(batch)
                 seconds = end - self._runtime.monotonic()
                 if seconds <= 0:
@@ -295,9 +324,9 @@ class Worker:
         self._demands.answer_withdrawn(batch)
         tip = self._repository.tip()
         results = self._published_before(str(tip), batch)
-        published = {ticket for ticket, _ in results}
+        booked = {ticket for ticket, _ in results}
         independent = len(results)
-        left = [ticket for ticket in batch if ticket not in published]
+        left = [ticket for ticket in batch if ticket not in booked]
         part, left = left[: self._backoff.max_demands], left[self._backoff.max_demands :]
         if self._approvals.proposals:
             self._approvals.remove_released(part, self.snapshot.state)
@@ -306,7 +335,7 @@ class Worker:
         # search for published demands and the deletion of released branches hold only for that tip
         if commits.start.commit != tip:
             return None
-        began = self._runtime.monotonic()
+        began, has_own_work = self._runtime.monotonic(), not commits.is_empty
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
@@ -330,7 +359,17 @@ class Worker:
             self._tip_is_fresh = True
             if self._repository.refresh() != commits.start.commit:
                 return None
-        if self._publish_commits(commits, results, independent):
+        try:
+            published = self._publish_commits(commits, results)
+        except PushDenied as refusal:
+            # what was decided before the batch had a commit does not depend on the push
+            self._answer(results[:independent])
+            refused = [ticket for ticket, _ in results[independent:]]
+            batch[:] = [ticket for ticket in part if ticket in refused] + left
+            if has_own_work and len(refused) == 1:  # which of the two is refused?
+                refused = []
+            return self._isolate(refused, batch, refusal)
+        if published:
             batch[:] = left
             self._demands.put_back(batch, [ticket for ticket, _ in results])
             self._backoff.begin_anew()
@@ -471,32 +510,69 @@ class Worker:
             return []
         return self._agenda.leases.tickets(snapshot.state.ledger)
 
-    def _publish_commits(
-        self, commits: CommitBatch, results: list[Result], independent: int
-    ) -> bool:
-        # False, without answers, if another writer was first or locks main. The first
-        # ``independent`` results were decided before the batch had a commit, so they do not depend
-        # on the push.
-        try:
-            published = commits.publish()
-        except PushDenied as error:
-            # a withdrawn demand gets its answer whatever the remote says
-            results[independent:] = [
-                (ticket, result if isinstance(result, errors.Withdrawn) else error)
-                for ticket, result in results[independent:]
-            ]
-            self.remote.record_push_denied(str(error))
-        else:
-            if not published:
-                return False
-            self._record_reached(pushed=not commits.is_empty)
-            self._record_published(commits)
+    def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
+        # false, without answers, if another writer was first or locks main
+        if not commits.publish():
+            return False
+        self._record_reached(pushed=not commits.is_empty)
+        self._record_published(commits)
+        self._is_writer_proven = self._is_writer_proven or not commits.is_empty
+        self._answer(results)
+        return True
+
+    def _answer(self, results: list[Result]) -> None:
         final = [(ticket, result) for ticket, result in results if not isinstance(result, Decision)]
         self._demands.answer(final)
         for ticket, result in results:
             if isinstance(result, Decision):
                 self._approvals.add(ticket, result)
-        return True
+
+    def _isolate(
+        self, refused: list[Ticket], batch: list[Ticket], refusal: PushDenied
+    ) -> float | None:
+        """Find out by further pushes whether the commits or the writer are refused.
+
+        After a refusal, half of the demands are tried, down to one. If its commit is refused while
+        another commit is accepted, the server has something against this demand, and answers it; if
+        the other is refused too, that refusal is raised, for it is of the writer.
+        """
+        for ticket in batch:
+            ticket.mark_maybe_published(str(self.snapshot.commit))
+        self._backoff.max_demands = max(1, len(refused) // 2)
+        self._leaves_due_work = True
+        if len(refused) > 1:
+            return None
+        for ticket in refused:
+            if ticket not in batch:  # the end of a lease, which is tried again in a minute
+                self._demands.fail([ticket], refusal)
+                continue
+            if ticket.demand != self._suspect:
+                self._suspect, self._refusals, self._is_writer_proven = ticket.demand, 0, False
+            self._refusals += 1
+            enough = _REFUSALS if refusal.is_verdict else _REFUSALS_WITHOUT_VERDICT
+            if self._is_writer_proven and self._refusals < enough:
+                return self._backoff.unreachable()
+            if self._is_writer_proven:
+                log.warning("demand %s: %s", ticket.operation, refusal)
+                self._demands.fail([ticket], refusal)
+                batch.remove(ticket)
+                self._suspect = None
+                self._backoff.begin_anew()
+                return None
+        # the smallest commit: of people's changes, or else one without files
+        commits = self._new_commit_batch()
+        if commits.is_empty:
+            now = self._runtime.now()
+            title, why = "Check that the server takes commits", "Why: it refused another commit."
+            trailers = [
+                ("Operation", "follow"),
+                *commits.head.trailers,
+                ("Render-Version", str(RENDER_VERSION)),
+            ]
+            text = compose([[title], [why]], trailers)
+            commits.commit_files({}, commits.head.state, text, generator_signature(now), now)
+        self._must_fetch = not self._publish_commits(commits, [])
+        return None
 
     # ---- following the state repo ----
 
@@ -518,7 +594,7 @@ class Worker:
         except FetchInterrupted:
             self._agenda.request_fetch()  # it is still due
         except StateRepoError as error:
-            self._record_unreachable(error)
+            self._record_failure(error)
             self._agenda.postpone()
 
     def _check_proposals(self) -> None:
@@ -542,11 +618,12 @@ class Worker:
         try:
             self._carry_out_changes(again=again)
         except StateRepoError as error:
-            self._record_unreachable(error)
+            self._record_failure(error)
 
     def _carry_out_changes(self, *, again: bool = False) -> bool:
         """Publish the effects of people's changes; return whether a commit was published."""
         # the caller has fetched the changes
+        self._leaves_due_work = False
         for _ in range(_TRIES):
             commits = self._new_commit_batch(again=again)
             if commits.publish():
@@ -572,7 +649,8 @@ class Worker:
             commits = CommitBatch(self._repository, followed.snapshot)
             commits.follow(followed, now)
             self._tell_of_faults(followed.snapshot)
-        self._agenda.commit_due(commits)
+        if not self._leaves_due_work:
+            self._agenda.commit_due(commits)
         return commits
 
     def _tell_of_faults(self, snapshot: Snapshot) -> None:
@@ -627,9 +705,15 @@ class Worker:
         self.remote.record_reached(pushed=pushed)
         self._agenda.fetched(reached=True)
 
-    def _record_unreachable(self, error: StateRepoError) -> None:
+    def _record_failure(self, error: StateRepoError) -> float:
+        # returns for how many seconds the remote denies all pushes; 0 if it is away
         if self._ends_soon.is_set():  # there is no retry to report
-            return
+            return 0.0
         self._demands.blocked = str(error)
+        if isinstance(error, PushDenied):
+            self._agenda.fetched(reached=True)
+            return self.remote.record_push_denied(str(error))
         self.remote.record_unreachable(str(error))
-        self._agenda.fetched(reached=False)
+        pause = error.retry_after_s if isinstance(error, Unavailable) else 0.0
+        self._agenda.fetched(reached=False, at_least_s=pause)
+        return 0.0

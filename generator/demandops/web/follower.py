@@ -118,12 +118,14 @@ class Follower:
         interval: float,
         *,
         progress: Progress = lambda done, total: None,
+        push_denied: Callable[[], str] = lambda: "",
     ) -> None:
         # `close` closes ``reader``. ``interval`` has the seconds between fetches from a remote; at
         # 0, the follower fetches only after `wake` or a change on a cluster.
         self._reader = reader
         self._interval = _LOOK_S if reader.repository.always_current else interval or None
         self._wake, self.closed = REAL.event(), REAL.event()
+        self._push_denied = push_denied
         self._watch = ClusterWatch(clusters, self._wake.set)
         self._commit_states: dict[str, CommitState] = {}
         self._loading = REAL.lock()
@@ -213,6 +215,7 @@ class Follower:
                 if not before.unread:
                     log.exception("the page cannot follow the state repo")
                 now = replace(before, unread=f"a fault of the program: {one_line(repr(error))}")
+            now = replace(now, push_denied=self._push_denied())
             if replace(now, now=before.now) != before:
                 self._newest = now
                 self.version += 1

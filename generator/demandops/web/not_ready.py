@@ -213,6 +213,14 @@ def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Caus
             ),
             told=now.unread,
         )
+    if now.push_denied:
+        yield Cause(
+            "unread",
+            Part("The state repo"),
+            "takes no commit of this generator, so demands wait, and are refused after some time",
+            Remedy("the operator of the Git server", "let the generator's account push to main"),
+            told=now.push_denied,
+        )
     for problem in now.commit_state.problems:
         change = last_change(problem.file)
         who = "the person who last changed it"

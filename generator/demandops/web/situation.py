@@ -226,6 +226,7 @@ class Situation:
     watched: frozenset[str] = frozenset()  # clusters
     proposals: tuple[PendingProposal, ...] = ()
     unread: str = ""  # why a newer state cannot be read or shown
+    push_denied: str = ""  # why the node that shows the page cannot publish demands
     old_bootstraps: tuple[OldBootstrap, ...] = ()
     orphans: tuple[Orphan, ...] = ()
 

@@ -76,7 +76,7 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
         for number in range(256):  # the server fails to store objects
             (objects / f"{number:02x}").touch()
         ticket = generator.submit(goal(1))
-        rig.wait_until(lambda: "cannot be pushed to: un" in caplog.text, "the log says why")
+        rig.wait_until(lambda: "rejects the push: un" in caplog.text, "the log says why")
         assert not ticket.future.done()
         shutil.rmtree(objects)
         aside.rename(objects)
@@ -124,7 +124,7 @@ def test_a_remote_with_main_checked_out_is_told_instead_of_tried_for_ever(
     bare: Path, person: Person
 ) -> None:
     person.fetch()
-    with rig.running(person.folder.as_uri()) as generator:
+    with rig.running(person.folder.as_uri(), refusal_patience_s=0.5) as generator:
         ticket = generator.submit(goal(1))
         with pytest.raises(StateRepoError, match="checked out"):
             rig.receipt(ticket)

@@ -72,7 +72,7 @@ def test_a_push_is_repeated_until_the_server_takes_it(bare: Path) -> None:
 def test_a_server_that_forbids_the_push_is_told_and_not_asked_for_ever(
     http: str, server: Server, bare: Path
 ) -> None:
-    with rig.running(http) as generator:
+    with rig.running(http, refusal_patience_s=0.5) as generator:
         server.faults.pushes_to_refuse, server.faults.status = 1000, 403
         with pytest.raises(StateRepoError, match="rejects the push"):
             rig.receipt(generator.submit(goal(1)))

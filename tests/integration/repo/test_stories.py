@@ -61,7 +61,11 @@ class Story:
     ) -> None:
         self._bare, self._person, self._data, self._log = bare, person, data, caplog
         self._clock = Clock()
-        self._options: dict[str, Any] = {"runtime": self._clock, "fetch_interval": 0.1}
+        self._options: dict[str, Any] = {
+            "runtime": self._clock,
+            "fetch_interval": 0.1,
+            "refusal_patience_s": 0.5,
+        }
         self._open = ExitStack()
         self._running: dict[str, ExitStack] = {}
         self._generators: dict[str, Generator] = {}

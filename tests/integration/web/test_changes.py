@@ -291,3 +291,14 @@ def test_a_state_repo_that_is_away_is_told_and_followed_again(
         assert client.get("/health").status_code == 503
     wait_until(lambda: not follower.newest.unread, "the page follows again")
     assert client.get("/health").status_code == 200
+
+
+def test_a_server_that_takes_no_commit_of_the_node_is_told(
+    follower: Follower, look: Look, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(follower, "_push_denied", lambda: "ERROR: the key is read-only")
+    follower.wake()
+    wait_until(lambda: follower.newest.push_denied, "the page knows")
+    told = look("/", status=200).text
+    assert "takes no commit of this generator" in told
+    assert "the key is read-only" in told

@@ -33,6 +33,9 @@ from demandops.serve.generator import Generator
 
 # ---- booking, and printing the changes ----
 
+# A person who waits at a terminal is told soon that the server refuses every commit.
+_REFUSAL_PATIENCE_S = 4.0
+
 
 def await_answer(future: Future[Any]) -> None:
     # Polled, so that Ctrl-C and SIGTERM interrupt it: a wait without a timeout could miss a signal
@@ -56,6 +59,7 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
             requester_limit=None,  # the command is its only client
             start_offline=False,
             signing_key=signing_key,
+            refusal_patience_s=_REFUSAL_PATIENCE_S,
             progress=report,
         )
     try:

@@ -11,6 +11,7 @@ os.environ["GIT_NO_REPLACE_OBJECTS"] = "1"
 for _name in (
     "GIT_ALTERNATE_OBJECT_DIRECTORIES",
     "GIT_COMMON_DIR",
+    "GIT_CURL_VERBOSE",  # it would hide what a server answers from this program
     "GIT_DIR",
     "GIT_GRAFT_FILE",
     "GIT_INDEX_FILE",

@@ -1,4 +1,4 @@
-"""Ends git, ssh and other programs that this process has started, if this process is killed.
+"""Runs git, and ends git, ssh and other programs if this process, which started them, is killed.
 
 A killed process cannot end its children, and git may wait for a silent server for long. So a shell
 waits beside this process, and ends all processes that inherited a mark in their environment: git,
@@ -13,6 +13,7 @@ import os
 import subprocess
 from contextlib import suppress
 from functools import cache
+from pathlib import Path
 
 from demandops.base.runtime import REAL
 
@@ -62,3 +63,49 @@ def _mark(pid: int) -> dict[str, str]:
     os.register_at_fork(after_in_child=pipe.close)
     atexit.register(finish)
     return {name: value}
+
+
+# ---- git, for what libgit2 cannot do ----
+
+_ENVIRONMENT = {
+    # git fails instead of asking for a password, because nobody may be there to answer
+    "GIT_TERMINAL_PROMPT": "0",
+    # git's errors are recognized by their English text
+    "LC_ALL": "C",
+    # git ends an HTTP transfer with less than 1 byte a second for 60 seconds
+    "GIT_HTTP_LOW_SPEED_LIMIT": "1",
+    "GIT_HTTP_LOW_SPEED_TIME": "60",
+}
+
+
+# Of a person's settings, those for access to the server count; those that start hooks, send more
+# or colour what is parsed do not. The repository is named, as safe.bareRepository may hide it.
+_SETTINGS = (
+    f"core.hooksPath={os.devnull}", "push.pushOption=", "color.ui=false", "gc.auto=0",
+    "maintenance.auto=false",
+)  # fmt: skip
+
+
+def git_environment() -> dict[str, str]:
+    return _ENVIRONMENT | mark()
+
+
+def git(folder: Path | str | None) -> list[str]:
+    """Return how a command line begins that runs git, in the repository whose folder is given."""
+    where = [f"--git-dir={folder}"] if folder else []
+    return ["git", *where, *(word for each in _SETTINGS for word in ("-c", each))]
+
+
+def run_git(
+    folder: Path | str | None, *command: str, stdin: str = "", cwd: str | None = None
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*git(folder), *command],
+        env=os.environ | git_environment(),
+        input=stdin,
+        cwd=cwd,
+        capture_output=True,
+        encoding="utf-8",
+        errors="surrogateescape",
+        check=False,
+    )

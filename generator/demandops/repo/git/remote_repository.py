@@ -1,4 +1,10 @@
-"""The state repo behind a URL: a bare clone, fetches, pushes, and the errors of git."""
+"""The state repo behind a URL: a bare clone, fetches, pushes, and what came of them.
+
+What came of a command is known by what happened, not by words that others write: by git's exit
+code, the porcelain line of a pushed reference, the answers over HTTP, and afterwards a look at the
+remote. A push that fails has *moved* (another writer was first), is *refused* (the remote can be
+read, and does not take it), or finds the remote *away*. Words only pick a remedy for a person.
+"""
 
 from __future__ import annotations
 
@@ -8,100 +14,181 @@ import re
 import shutil
 import signal
 import subprocess
+import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
+from email.utils import parsedate_to_datetime
 from pathlib import Path
 
-import git
 import pygit2
 from pygit2 import Oid, Repository
 
 from demandops.base.addresses import without_secrets
 from demandops.base.errors import StateRepoError
+from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
+from demandops.repo.git import child_processes, slow_git
 from demandops.repo.git import repository as repositories
 from demandops.repo.git.objects import NewObjects
-from demandops.repo.git.repository import MAIN, DiskFull, FetchInterrupted, RemoteAway, Unavailable
-from demandops.repo.git.slow_git import SlowGit
-
-_REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
-_REMOTE_MOVED = re.compile(r"\[rejected\]")
-_REMOTE_MESSAGE = re.compile(r"remote: ?(.*)")
-_REMOTE_REJECTED = re.compile(r"\[remote rejected\] \((.*)\)")
-# A temporary rejection: the cause is the server or another writer, not a rule.
-_TEMPORARY = re.compile(
-    r"lock|failed to update ref|incorrect old value|unpack|bad pack|"
-    r"unable to (create|migrate|write)"
+from demandops.repo.git.repository import (
+    MAIN,
+    FetchInterrupted,
+    PushDenied,
+    RemoteAway,
+    Unavailable,
 )
-# The reason of a permanent rejection: the server will never accept the push.
-_RULE = re.compile(r"fsck|exceeds maximum|[Ii]nsufficient permission")
-# Lines at the end of git's output that do not give the reason of a failure.
-_WITHOUT_REASON = re.compile(
+
+log = logging.getLogger("demandops")
+
+Notify = Callable[[str], None]
+
+# ---- one git command with a remote, and what came of it ----
+
+# A server that asks for more patience than this is asked again all the same.
+_LONGEST_RETRY_AFTER_S = 300.0
+# A push that fails without a verdict after this time was not refused: its server is slow, or gone.
+_LONGEST_REFUSAL_S = 30.0
+# Lines of GIT_TRACE_CURL: a request, the status of an answer, and what a header says.
+_HTTP = re.compile(
+    r"=> Send header: ((?:GET|POST) )|<= Recv header: HTTP/\S+ ([2-5]\d\d)"
+    r"|<= Recv header: (content-type|retry-after): *([^\r\n]*)",
+    re.IGNORECASE,
+)
+# A line of ``git push --porcelain``: a reference, and what came of it.
+_PORCELAIN = re.compile(r"^.\t[^\t\n]*:([^\t\n:]+)\t(\[.*?\])?(?: \((.*)\))?", re.MULTILINE)
+# What git says after any failure; it hides what the server has said.
+_SAYS_NOTHING = re.compile(
     r"fatal: Could not read from remote repository|fatal: the remote end hung up|"
     r"error: failed to push some refs|Please make sure you have the correct access|"
     r"and the repository exists|send-pack: unexpected disconnect|fatal: expected flush after|"
     r"fatal: unknown error occurred while reading the configuration files"
 )
-# Pairs: a pattern that matches git's reason, and the remedy for a person.
+_PAGE = "a web page, such as a login, answers in place of a Git server; check the address"
+_COLOURS = re.compile(r"\x1b\[[\d;]*[A-Za-z]")
+
+
+@dataclass(frozen=True, slots=True)
+class GitResult:
+    code: int  # negative if git was ended by a signal
+    out: str
+    err: str
+    http: str = ""  # the headers that git sent and received
+    seconds: float = 0.0
+
+    def line_of(self, reference: str) -> tuple[str, str]:
+        """Return what git says of a pushed reference: ``[remote rejected]``, and the reason."""
+        lines = (line[1:] for line in _PORCELAIN.findall(self.out) if line[0] == reference)
+        return next(lines, ("", ""))
+
+    def took(self, reference: str) -> bool:
+        # not if the server did something else with the push, such as opening a merge request
+        return not self.code and any(line[0] == reference for line in _PORCELAIN.findall(self.out))
+
+    def is_verdict(self, reference: str) -> bool:
+        """Whether the server has answered that it does not take the reference."""
+        is_refused = 400 <= self._answer()[0] < 500 and not self.is_absence
+        return self.line_of(reference)[0] == "[remote rejected]" or is_refused
+
+    @property
+    def is_page(self) -> bool:
+        """Whether a login or a captive portal has answered, and not a Git server."""
+        status, kind, _ = self._answer()
+        return status == 200 and bool(kind) and not kind.startswith("application/x-git")
+
+    @property
+    def is_absence(self) -> bool:
+        """Whether nobody has answered who could refuse something; a look at the remote may tell."""
+        is_away = self._answer()[0] in (408, 425, 429, 503)
+        return self.code < 0 or self.is_page or is_away
+
+    @property
+    def retry_after_s(self) -> float:
+        text = self._answer()[2]
+        with suppress(ValueError, TypeError):
+            if not text.isdecimal():
+                text = str((parsedate_to_datetime(text) - REAL.now()).total_seconds())
+            return max(0.0, min(float(text), _LONGEST_RETRY_AFTER_S))
+        return 0.0
+
+    def _answer(self) -> tuple[int, str, str]:
+        # the last answer: its status (0 if a request has none), Content-Type and Retry-After
+        status, headers = 0, dict[str, str]()
+        for sent, code, name, value in _HTTP.findall(self.http):
+            if sent or code:
+                status, headers = int(code or 0), {}
+            else:
+                headers[name.lower()] = value.strip()
+        return status, headers.get("content-type", ""), headers.get("retry-after", "")
+
+    @property
+    def words(self) -> str:
+        """What the server has said, in one line; else git's own words."""
+        lines = [
+            line.strip().removeprefix("remote:").strip()
+            for line in re.split(r"[\r\n]", _COLOURS.sub("", without_secrets(self.err)))
+            if not line.startswith("To ")
+        ]
+        lines = [line for line in lines if re.search(r"\w", line)]  # without frames
+        telling = [line for line in lines if not _SAYS_NOTHING.search(line)] or lines
+        return one_line(" ".join(dict.fromkeys(telling))) or "git gave no reason"
+
+
+# Pairs: a pattern that matches a reason, in any case, and the remedy for a person.
 _REMEDIES = (
+    ("no space left on device", "free some room on the disk of the clone, or of the server"),
     (
-        re.compile(r"resolve host|Name or service not known", re.IGNORECASE),
-        "check the host in the address, and the network",
-    ),
-    (
-        re.compile(
-            r"returned error: 40[13]|permission denied|access denied|authentication failed|"
-            r"could not read (username|password)|host key verification failed",
-            re.IGNORECASE,
-        ),
+        r"error: 40[13]|permission denied|access denied|authentication failed|"
+        r"could not read (username|password)|host key verification failed",
         "git needs credentials for this address: a credential helper, ~/.netrc or an SSH key",
     ),
     (
-        re.compile(r"not found|returned error: 404|does not appear to be a git", re.IGNORECASE),
+        "not found|error: 404|does not appear to be a git",
         "check the path in the address, and whether you may read the repository",
     ),
     (
-        re.compile(r"detected dubious ownership"),
+        "detected dubious ownership",
         "check the path in the address, and who owns the repository's files",
     ),
     (
-        re.compile(r"not our ref 0{40}"),
+        "not our ref 0{40}",
         "the server cannot read the branch: check the server's disk, and who may read the "
         "repository's files",
     ),
     (
-        re.compile(r"refused|timed out|unreachable|couldn't connect", re.IGNORECASE),
+        "resolve host|name or service not known|refused|timed out|unreachable|couldn't connect",
         "check the host and the port in the address, and the network",
     ),
+    (r"\bconfig (value|variable|line)\b", "mend that line of your settings for git"),
 )
-# Git's error if the remote also has a reference like ``refs/heads/refs/heads/main``.
-_AMBIGUOUS = re.compile(r"dst refspec \S+ matches more than one")
+# Git's error if it cannot read a file, here or on the server: credentials do not mend that.
+_NO_FILE = re.compile(r"unable to access '[^':]*':.*")
+
+
+# ---- the clone ----
+
+_REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to", "fsck": "checking the clone of"}
 _CLONE_TIMEOUT_S = 3600  # Git ends an idle HTTP transfer much earlier
-# This machine's disk, not the server's, whose errors begin with ``remote:``.
-_NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
-# Git's errors about its own clone: unreadable, or without the remote ``origin``.
-_NO_CLONE = re.compile(
-    r"^(?!remote:).*fatal: (not a git repository|'origin' does not appear to be a git|"
-    r"detected dubious ownership in repository at '.*/clone\.git')",
-    re.MULTILINE,
-)
-# Git's error if it cannot read a file, here or on the server. Its error about a URL that it cannot
-# reach does not match, because a URL has a colon.
-_NO_FILE = re.compile(r".*unable to access '[^':]*':.*")
-_NO_PERMISSION = re.compile(
-    r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
-)
-
-Notify = Callable[[str], None]
-
-log = logging.getLogger("demandops")
+# What git says if the remote also has a reference like ``refs/heads/refs/heads/main``.
+_AMBIGUOUS = re.compile(r"^error: dst refspec \S+ matches more than one", re.MULTILINE)
+# A person's settings for fetches and pushes of work trees do not count here. The remote is named by
+# its URL, so no ``remote.origin.*`` counts either. Settings for access do: credentials, proxies,
+# SSH, ``url.*.insteadOf``.
+_FETCH = (
+    "fetch", "--no-tags", "--no-recurse-submodules", "--no-auto-maintenance",
+    "--no-write-fetch-head", "--no-write-commit-graph", "--quiet",
+)  # fmt: skip
+_PUSH = (
+    "push", "--porcelain", "--no-verify", "--no-signed", "--no-follow-tags",
+    "--no-force-if-includes", "--recurse-submodules=no",
+)  # fmt: skip
 
 
 class RemoteRepository(repositories.StateRepository):
-    """A state repo behind a URL, in a bare clone. Git runs with the user's configuration."""
+    """A state repo behind a URL, in a bare clone."""
 
     always_current = False
     main_reference = _REMOTE_MAIN
@@ -128,10 +215,9 @@ class RemoteRepository(repositories.StateRepository):
 
     def _open(self) -> None:
         try:
-            self._git = git.Repo(self._folder)
-        except (git.InvalidGitRepositoryError, git.NoSuchPathError):
+            self.objects = Repository(str(self._folder))
+        except pygit2.GitError:
             raise self._unreadable() from None
-        self.objects = Repository(str(self._folder))
         self.new = NewObjects(self.objects)
         self.new.clean()
 
@@ -143,75 +229,81 @@ class RemoteRepository(repositories.StateRepository):
             # git needs more of the files than libgit2, so check HEAD too
             head = (self._folder / "HEAD").read_text()
             is_whole = is_whole and re.fullmatch(r"ref: refs/heads/\w+\n", head) is not None
-            return is_whole and git.Repo(self._folder).remote("origin").url == self._url
+            return is_whole and repo.config["remote.origin.url"] == self._url
         except Exception:  # whatever the damage, a new clone repairs it
             return False
 
     def renew_if_damaged(self) -> bool:
-        try:
-            with git.Repo(self._folder) as repo:
-                self._run_git(repo, "fsck", "--no-dangling", "--no-progress")
+        checked = self._run_git("fsck", "--no-dangling", "--no-progress")
+        if not checked.code or self._aborted:
             return False
-        except RemoteAway:  # the check was aborted
-            return False
-        except Exception as error:
-            log.warning(
-                "the clone %s does not pass git's check (%s); making it anew", self._folder, error
-            )
+        text = "the clone %s does not pass git's check (%s); making it anew"
+        log.warning(text, self._folder, checked.words)
         self._clone(log.info)
         self._open()
         return True
 
     def _clone(self, notify: Notify) -> None:
         notify(f"cloning {self.address}")
-        self._folder.parent.mkdir(parents=True, exist_ok=True)
+        folder = self._folder
+        folder.parent.mkdir(parents=True, exist_ok=True)
         # a killed process must not leave half a clone under the final name
-        partial = self._folder.with_name(self._folder.name + ".partial")
-        shutil.rmtree(partial, ignore_errors=True)
-        with git.Repo.init(partial, bare=True, object_format="sha1") as repo:
-            with repo.config_writer() as config:
-                config.set_value('remote "origin"', "url", self._url)
-                config.set_value("gc", "auto", 0)  # tidy joins the packs, not a fetch
-                # Keep each fetched pack, because git syncs packs. Loose objects may be half-written
-                # after a crash, and libgit2 hangs on them.
-                config.set_value("fetch", "unpackLimit", 1)
-            partial.joinpath("config").chmod(0o600)
-            self._fetch(repo, timeout=_CLONE_TIMEOUT_S)
-        if self._folder.exists():
-            shutil.rmtree(self._folder)
-        partial.rename(self._folder)
+        self._folder = folder.with_name(f"{folder.name}.partial")
+        try:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            # by libgit2, which copies no hooks and settings from a person's template
+            made = pygit2.init_repository(str(self._folder), bare=True, initial_head=MAIN_BRANCH)
+            made.config["remote.origin.url"] = self._url
+            made.config["gc.auto"] = 0  # tidy joins the packs, not a fetch
+            # Keep each fetched pack, because git syncs packs. Loose objects may be half-written
+            # after a crash, and libgit2 hangs on them.
+            made.config["fetch.unpackLimit"] = 1
+            (self._folder / "config").chmod(0o600)
+            self._fetch(timeout=_CLONE_TIMEOUT_S)
+            if folder.exists():
+                shutil.rmtree(folder)
+            self._folder.rename(folder)
+        finally:
+            self._folder = folder
 
     def _fetch(
         self,
-        repo: git.Repo,
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = repositories.TIMEOUT_S,
     ) -> None:
         # The refspec is not in git's configuration. If it were, a push that outlives its generator
         # would move the reference.
-        spec = f"+{MAIN}:{_REMOTE_MAIN}"
-        self._read_remote(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
+        command = (*_FETCH, "--no-prune", self._url, f"+{MAIN}:{_REMOTE_MAIN}")
+        fetched = self._run_git(*command, urgent=urgent, timeout=timeout)
+        if not fetched.code:
+            return
+        if not fetched.is_absence:  # by its exit code, ls-remote tells that there is no such branch
+            listing = ("ls-remote", "--quiet", "--exit-code", self._url, MAIN)
+            listed = self._run_git(*listing, urgent=urgent)
+            if listed.code == 2 and not listed.is_page:
+                raise repositories.missing_main(self.address)
+        raise self._read_error("fetched", fetched)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        self._fetch(self._git, urgent)
+        self._fetch(urgent)
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
         # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
         try:
             with self.new.packed(commit):
-                self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
+                pushed = self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except (pygit2.GitError, OSError) as error:
             raise repositories.access_error(error, f"the clone {self._folder}") from None
-        except git.GitCommandError as error:
-            if _REMOTE_MOVED.search(str(error)):  # git sent nothing
+        if not pushed.took(MAIN):
+            if pushed.line_of(MAIN)[0] == "[rejected]":  # git sent nothing
                 return False
             tip = self.refresh()
             if tip == commit or self.objects.descendant_of(tip, commit):
                 return True  # the push succeeded, but the answer was lost
             if tip != expected:
                 return False
-            raise self.push_error(error) from None
+            raise self.push_error(pushed, MAIN)
         try:
             self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         except (pygit2.GitError, OSError) as error:  # the next fetch moves the reference
@@ -220,79 +312,64 @@ class RemoteRepository(repositories.StateRepository):
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
-        # name → commit; the patterns are those of ``git ls-remote``
-        out = self._read_remote(self._git, ("ls-remote",), *patterns)
-        pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
+        listed = self._run_git("ls-remote", "--quiet", self._url, *patterns)
+        if listed.code or listed.is_page:
+            raise self._read_error("read", listed)
+        pairs = (line.split("\t", 1) for line in listed.out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
     def fetch_branches(self, prefix: str) -> None:
         # what the remote has deleted, this clone deletes too
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
-        self._read_remote(self._git, ("fetch", "--no-tags", "--prune"), spec)
+        fetched = self._run_git(*_FETCH, "--prune", self._url, spec)
+        if fetched.code:
+            raise self._read_error("fetched", fetched)
 
-    def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
-        """Push one reference and return git's output, or raise GitCommandError.
+    def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> GitResult:
+        """Push one reference.
 
         ``spec`` is ``<commit>:<reference>``, or ``:<reference>`` to delete it. ``lease`` is
         ``<reference>:<commit>``: the commit that the remote's reference must have; if it is empty,
         the reference must not exist. ``options`` are those of ``git push --push-option``.
         """
         push_options = [f"--push-option={option}" for option in options]
-        command = ("push", "--porcelain", *push_options, f"--force-with-lease={lease}", "origin")
-        try:
-            out, err = self._run_git(self._git, *command, spec)
-        except git.GitCommandError as error:
-            commit, _, reference = spec.partition(":")
-            if not commit or not _AMBIGUOUS.search(str(error.stderr)):
-                raise
+        command = (*_PUSH, *push_options, f"--force-with-lease={lease}", self._url)
+        pushed = self._run_git(*command, spec)
+        commit, _, reference = spec.partition(":")
+        if pushed.code and commit and _AMBIGUOUS.search(pushed.err):
             # Git finds a plain reference ambiguous if another one ends with it, but not the result
             # of a pattern. The source of a pattern must be a reference, so one is made.
-            pushed = f"refs/pushed/{reference}"
-            self.objects.references.create(pushed, Oid(hex=commit), force=True)
+            source = f"refs/pushed/{reference}"
+            self.objects.references.create(source, Oid(hex=commit), force=True)
             try:
-                out, err = self._run_git(self._git, *command, f"{pushed}*:{reference}*")
+                pushed = self._run_git(*command, f"{source}*:{reference}*")
             finally:
-                self.objects.references.delete(pushed)
-        return f"{out}\n{err}"
+                self.objects.references.delete(source)
+        return pushed
 
-    def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return PushDenied if another attempt at a push would fail too, else Unavailable."""
-        text = without_secrets(f"{error.stdout}\n{error.stderr}")
-        if error_here := self._error_of_clone(text):
-            return error_here
-        rejected, reason = _REMOTE_REJECTED.search(text), _reason(text)
-        if rejected:
-            message = " ".join(line.strip(" '") for line in _REMOTE_MESSAGE.findall(text)).strip()
-            reason = f"{rejected[1]}: {message}" if message else rejected[1]
-            is_final = bool(_RULE.search(text)) or not _TEMPORARY.search(rejected[1])
-        else:
-            is_final = bool(_NO_PERMISSION.search(_NO_FILE.sub("", text)))
-        if is_final:
-            return repositories.PushDenied(f"{self.address} rejects the push: {reason}")
-        return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
+    def push_error(self, pushed: GitResult, reference: str) -> StateRepoError:
+        """Return PushDenied if the remote, which can be read, refused a push; else Unavailable."""
+        is_verdict = pushed.is_verdict(reference)
+        is_away = pushed.is_absence or pushed.seconds > _LONGEST_REFUSAL_S
+        if not self._is_readable or (is_away and not is_verdict):
+            return self._read_error("pushed to", pushed)
+        reason = ": ".join(filter(None, (pushed.line_of(reference)[1], pushed.words)))
+        if not pushed.code:
+            reason = f"it takes the push, but leaves {reference} where it is"
+        return PushDenied(f"{self.address} rejects the push: {reason}", is_verdict=is_verdict)
 
-    def _read_remote(
-        self,
-        repo: git.Repo,
-        command: Sequence[str],
-        *references: str,
-        urgent: Callable[[], bool] = lambda: False,
-        timeout: float = repositories.TIMEOUT_S,
-    ) -> str:
-        command = (*command, "--quiet", "origin", *references)
-        try:
-            return self._run_git(repo, *command, urgent=urgent, timeout=timeout)[0]
-        except git.GitCommandError as error:
-            text = without_secrets(str(error.stderr))
-        if "couldn't find remote ref" in text:
-            raise repositories.missing_main(self.address)
-        if error_here := self._error_of_clone(text):
-            raise error_here
-        failed = "read" if command[0] == "ls-remote" else "fetched"
-        reason = _reason(text)
-        remediable = _NO_FILE.sub("", reason)  # credentials do not make a file readable
-        remedy = next((f"; {told}" for words, told in _REMEDIES if words.search(remediable)), "")
-        raise RemoteAway(f"{self.address} cannot be {failed}: {reason}{remedy}")
+    def _read_error(self, doing: str, read: GitResult) -> Unavailable:
+        if not self._is_readable:
+            return self._unreadable()
+        reason = _PAGE if read.is_page else read.words
+        remediable = _NO_FILE.sub("", reason)
+        remedies = (f"; {told}" for words, told in _REMEDIES if re.search(words, remediable, re.I))
+        text = f"{self.address} cannot be {doing}: {reason}{next(remedies, '')}"
+        return RemoteAway(text, read.retry_after_s)
+
+    @property
+    def _is_readable(self) -> bool:
+        return (self._folder / "HEAD").is_file()
 
     def _unreadable(self) -> Unavailable:
         return Unavailable(
@@ -300,59 +377,57 @@ class RemoteRepository(repositories.StateRepository):
             "check the clone's owner and disk, then start again, which replaces a damaged clone"
         )
 
-    def _error_of_clone(self, text: str) -> Unavailable | None:
-        if _NO_ROOM.search(text):
-            return DiskFull(
-                f"{self.address} cannot be fetched or pushed: the disk of {self._folder} has no "
-                "room; free some"
-            )
-        return self._unreadable() if _NO_CLONE.search(text) else None
-
     def _run_git(
         self,
-        repo: git.Repo,
         *command: str,
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = repositories.TIMEOUT_S,
-    ) -> tuple[str, str]:
+    ) -> GitResult:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
-        with repo.git.custom_environment(**repositories.git_environment()):
-            guard = repo.git.execute(  # keep the guard: its garbage collection ends the process
-                [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
-                as_process=True,
+        with tempfile.NamedTemporaryFile("r", prefix="demandops-", errors="replace") as http:
+            trace = {"GIT_TRACE_CURL": http.name, "GIT_TRACE_CURL_NO_DATA": "1"}
+            process = subprocess.Popen(
+                [*child_processes.git(self._folder), *command],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                cwd=self._folder.parent,
+                env=os.environ | child_processes.git_environment() | trace,
                 start_new_session=True,
             )
-        process = guard.proc
-        assert process is not None  # noqa: S101 - it was started just now
-        self._process = process
-        if self._aborted:  # another thread has called abort since the first check
-            self.abort()
-        slow = SlowGit(f"{_DOING.get(command[0], 'asking')} {self.address}")
-        start = REAL.monotonic()
-        try:
-            while True:
-                with suppress(subprocess.TimeoutExpired):
-                    out, err = process.communicate(timeout=_POLL_S)
-                    break
-                slow.lasts(REAL.monotonic() - start)
-                self.while_waiting()
-                if urgent():
+            self._process = process
+            if self._aborted:  # another thread has called abort since the first check
+                self.abort()
+            start, told = REAL.monotonic(), 0
+            try:
+                while True:
+                    with suppress(subprocess.TimeoutExpired):
+                        out, err = process.communicate(timeout=_POLL_S)
+                        break
+                    took = REAL.monotonic() - start
+                    if int(took) > told:
+                        told, doing = int(took), _DOING.get(command[0], "asking")
+                        slow_git.tell(f"{doing} {self.address}, {told} s")
+                    self.while_waiting()
+                    if urgent():
+                        raise FetchInterrupted("the fetch was interrupted by a demand")
+                    if took >= timeout:
+                        out, err = _terminate(process)
+                        break
+            finally:
+                if process.returncode is None:
                     _terminate(process)
-                    raise FetchInterrupted("the fetch was interrupted by a demand")
-                if REAL.monotonic() - start >= timeout:
-                    out, err = _terminate(process)
-                    break
-        finally:
-            self._process = None
-            slow.ends()
-        if process.returncode < 0:
-            err += f"\nfatal: git was ended by signal {-process.returncode}".encode()
-        if process.returncode and REAL.monotonic() - start >= timeout:
-            err += f"\nfatal: git timed out after {timeout:g} s".encode()
-        if process.returncode:
-            raise git.GitCommandError(list(command), process.returncode, err, out)
-        return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
+                self._process = None
+                if told:
+                    slow_git.tell("")
+            texts = [text.decode("utf-8", "replace") for text in (out, err)]
+            code, took = process.returncode, REAL.monotonic() - start
+            if code < 0:
+                ended = f"was ended by signal {-code}"
+                ended = f"timed out after {timeout:g} s" if took >= timeout else ended
+                texts[1] += f"\nfatal: git {ended}"
+            return GitResult(code, texts[0], texts[1], http.read(), took)
 
     def abort(self) -> None:
         self._aborted = True
@@ -370,13 +445,3 @@ def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
         with suppress(subprocess.TimeoutExpired):
             return process.communicate(timeout=patience)
     raise AssertionError("a killed process has ended")  # pragma: no cover
-
-
-def _reason(text: str) -> str:
-    # GitPython puts git's output into quotation marks
-    text = text.replace("stderr: '", "")
-    stripped = [line.strip(' "') for line in text.splitlines() if line.strip(" '\"")]
-    lines = [line.removesuffix("'") if line.count("'") % 2 else line for line in stripped]
-    telling = [line for line in lines if not _WITHOUT_REASON.search(line)] or lines
-    fatal = [line for line in telling if line.startswith(("fatal:", "error:", "remote:", "!"))]
-    return (fatal or telling or ["git gave no reason"])[-1].rstrip(".")

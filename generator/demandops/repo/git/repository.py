@@ -9,6 +9,7 @@ import subprocess
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pygit2
@@ -25,31 +26,18 @@ from demandops.repo.git.signing import Signer
 
 MAIN = f"refs/heads/{MAIN_BRANCH}"
 TIMEOUT_S = 120
-_ENVIRONMENT = {
-    # git fails instead of asking for a password, because nobody may be there to answer
-    "GIT_TERMINAL_PROMPT": "0",
-    # git's errors are recognized by their English text
-    "LC_ALL": "C",
-    # git ends an HTTP transfer with less than 1 byte a second for 60 seconds
-    "GIT_HTTP_LOW_SPEED_LIMIT": "1",
-    "GIT_HTTP_LOW_SPEED_TIME": "60",
-}
-
-
-def git_environment() -> dict[str, str]:
-    return _ENVIRONMENT | child_processes.mark()
 
 
 class Unavailable(StateRepoError):
     """Raised when the state repo cannot be read or written now; demands stay in the journal."""
 
+    def __init__(self, text: str, retry_after_s: float = 0.0) -> None:
+        super().__init__(text)
+        self.retry_after_s = retry_after_s  # what the server asks for
+
 
 class RemoteAway(Unavailable):
-    """Raised without network or rights to fetch, or if a push fails for a temporary reason."""
-
-
-class DiskFull(Unavailable):
-    """Raised when the disk of the state repo, or of its clone, has no room."""
+    """Raised when the remote cannot be read, or nobody answers a push."""
 
 
 class FetchInterrupted(StateRepoError):
@@ -57,7 +45,15 @@ class FetchInterrupted(StateRepoError):
 
 
 class PushDenied(StateRepoError):
-    """Raised when a write fails for a lasting reason, such as a hook or a protected branch."""
+    """Raised when a push fails although the remote can be read, or the disk permits no write.
+
+    Whether the commits or the writer are refused, only further pushes show. Without a verdict of
+    the server, such as over SSH, the connection may have failed.
+    """
+
+    def __init__(self, text: str, *, is_verdict: bool = True) -> None:
+        super().__init__(text)
+        self.is_verdict = is_verdict
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -76,7 +72,7 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
     else:
         what = os.strerror(number)
     if number in _NO_ROOM:
-        return DiskFull(f"{address} cannot be written: its disk has no room ({what}); free some")
+        return Unavailable(f"{address} cannot be written: its disk has no room ({what}); free some")
     if number == errno.EROFS:
         return PushDenied(f"{address} cannot be written: {what}; make its file system writable")
     if number in _NOT_ALLOWED:
@@ -187,6 +183,14 @@ class StateRepository(ABC):
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target
 
+    def list_references(self, *patterns: str) -> dict[str, str]:
+        # name → commit; the patterns are those of ``git ls-remote``
+        repo = Repository(self.objects.path)
+        names = (n for n in repo.references if any(fnmatchcase(n, pattern) for pattern in patterns))
+        # another process may delete a branch meanwhile, so a name may have no reference
+        pairs = ((name, repo.references.get(name)) for name in names)
+        return {name: str(reference.target) for name, reference in pairs if reference is not None}
+
     @abstractmethod
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         """Fetch and return the newest published commit.
@@ -253,9 +257,15 @@ class StateRepository(ABC):
         self._tidying = subprocess.Popen(
             # --geometric joins a pack only with those of about its size, so that a demand's small
             # pack does not let git write the whole history again
-            ["git", "repack", "--geometric=2", "-d", "-l", "--quiet"],
-            cwd=self.objects.path,
-            env=os.environ | git_environment(),
+            [
+                *child_processes.git(self.objects.path),
+                "repack",
+                "--geometric=2",
+                "-d",
+                "-l",
+                "--quiet",
+            ],
+            env=os.environ | child_processes.git_environment(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # so that Ctrl-C does not end it

@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-import git
 from pygit2 import Commit, Oid, Repository
 
 from demandops.base.errors import StateRepoError
@@ -165,20 +164,18 @@ def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
 def _check_with_git(
     repo: Repository, allowed: str, commits: list[str]
 ) -> dict[str, tuple[str, str]]:
-    with tempfile.TemporaryDirectory(prefix="demandops-") as folder, git.Repo(repo.path) as opened:
-        file = Path(folder) / "allowed-signers"
-        file.write_text(allowed)
-        revisions = Path(folder) / "commits"
-        revisions.write_text("\n".join(commits) + "\n")
-        with revisions.open("rb") as lines:
-            output = opened.git.execute(
-                [
-                    *(opened.git.GIT_PYTHON_GIT_EXECUTABLE, *_CONFIG),
-                    *("-c", f"gpg.ssh.allowedSignersFile={file}"),
-                    *("log", "--no-show-signature", "--no-walk=unsorted", "--stdin"),
-                    *("-z", "--format=%H %G? %GS"),
-                ],
-                istream=lines,
-            )
-    rows = (row.split(" ", 2) for row in str(output).split("\0") if row)
+    with tempfile.NamedTemporaryFile("w", prefix="demandops-") as file:
+        file.write(allowed)
+        file.flush()
+        ran = child_processes.run_git(
+            repo.path,
+            *_CONFIG,
+            *("-c", f"gpg.ssh.allowedSignersFile={file.name}"),
+            *("log", "--no-show-signature", "--no-walk=unsorted", "--stdin"),
+            *("-z", "--format=%H %G? %GS"),
+            stdin="\n".join(commits) + "\n",
+        )
+    if ran.returncode:
+        raise StateRepoError(f"git cannot check signatures: {ran.stderr}")
+    rows = (row.split(" ", 2) for row in ran.stdout.split("\0") if row)
     return {id: (state, signer) for id, state, signer in rows}

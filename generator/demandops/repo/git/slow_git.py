@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-AFTER_S = 1  # how many seconds git may take before the listener is called
-
 _listeners: list[Callable[[str], None]] = []
 
 
@@ -15,16 +13,6 @@ def listen(listener: Callable[[str], None]) -> None:
     _listeners[:] = [listener]
 
 
-class SlowGit:
-    def __init__(self, what: str) -> None:
-        self._what, self._told = what, 0
-
-    def lasts(self, seconds: float) -> None:
-        if int(seconds) > self._told and int(seconds) >= AFTER_S:
-            self._told = int(seconds)
-            for listener in _listeners:
-                listener(f"{self._what}, {self._told} s")
-
-    def ends(self) -> None:
-        for listener in _listeners if self._told else ():
-            listener("")
+def tell(text: str) -> None:
+    for listener in _listeners:
+        listener(text)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
+import os
 import re
+import shutil
 from collections.abc import Iterable, Iterator
 from itertools import islice
 
 import pygit2
 from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
-from pygit2.enums import FileMode, SortMode
+from pygit2.enums import ConfigLevel, FileMode, SortMode
 
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import quoted
@@ -18,6 +21,28 @@ pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 # By default libgit2 does not cache trees over 4 KiB and parses them at every look-up.
 pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
+if shutil.which("git") is None:
+    raise ImportError("git is not installed")
+
+# One wrong line in a person's settings for git stops git and libgit2 alike. They go on without.
+for _read in (
+    pygit2.Config.get_global_config,
+    pygit2.Config.get_xdg_config,
+    lambda: pygit2.Config(os.environ.get("GIT_CONFIG_GLOBAL", os.devnull)),
+):
+    try:
+        _read()
+    except OSError:
+        continue  # there is no such file
+    except pygit2.GitError as _error:
+        for _level in (ConfigLevel.GLOBAL, ConfigLevel.XDG):
+            pygit2.settings.search_path[_level] = ""
+        os.environ["GIT_CONFIG_GLOBAL"] = os.devnull
+        logging.getLogger("demandops").warning(
+            "your settings for git are left out, also those for credentials: %s; mend that line",
+            _error,
+        )
+        break
 
 MAX_DEPTH = 64  # how many folders deep a file may be; deeper folders are not read
 

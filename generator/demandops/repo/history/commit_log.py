@@ -11,7 +11,6 @@ from datetime import datetime, timezone
 from functools import cache
 from typing import Literal, NamedTuple, get_args
 
-import git
 import pygit2
 from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
@@ -21,7 +20,7 @@ from demandops.base.settings import GENERATED_ROOTS
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.ledger.claim import LEDGER_ROOT
 from demandops.render.gitops import CLUSTERS_ROOT
-from demandops.repo.git import signing
+from demandops.repo.git import child_processes, signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.tree import commit_of
 from demandops.repo.history.commit_message import (
@@ -266,12 +265,11 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
 def _git_log(repo: Repository, tip: str | Oid, after: str | None, *query: str) -> list[str]:
     *options, path = query
     commits = [str(commit_of(repo, tip).id), *([f"^{commit_of(repo, after).id}"] if after else [])]
-    with git.Repo(repo.path) as opened:
-        try:
-            output = opened.git.log("--no-show-signature", "-z", *options, *commits, "--", path)
-        except git.GitCommandError as error:
-            raise StateRepoError(f"git cannot read the history of {path}: {error.stderr}") from None
-    return [item for item in output.split("\0") if item]
+    command = ("log", "--no-show-signature", "-z", *options, *commits, "--", path)
+    ran = child_processes.run_git(repo.path, *command)
+    if ran.returncode:
+        raise StateRepoError(f"git cannot read the history of {path}: {ran.stderr}")
+    return [item for item in ran.stdout.split("\0") if item]
 
 
 # ---- authors: who made a commit or caused a follow commit, and who runs this program ----
@@ -351,8 +349,8 @@ def operator(folder: str | None = None) -> Person:
         login = "unknown"
 
     def configured(variable: str, key: str) -> str:
-        setting = git.Git(folder).config("--get", key, with_exceptions=False)
-        return os.environ.get(variable) or str(setting)
+        ran = child_processes.run_git(None, "config", "--get", key, cwd=folder)
+        return os.environ.get(variable) or ran.stdout.strip()
 
     name = configured("GIT_AUTHOR_NAME", "user.name") or login
     email = configured("GIT_AUTHOR_EMAIL", "user.email") or f"{login}{_NO_ADDRESS}"

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
 
-import git
 from pygit2 import GitError, Oid, Repository, Tree
 
 from demandops.base import naming
@@ -33,7 +32,7 @@ log = logging.getLogger("demandops")
 
 PREFIX = "demand/"
 _HEADS = "refs/heads/"
-_NO_OPTIONS = re.compile(r"does not support push options")
+_NO_OPTIONS = re.compile(r"^fatal: the receiving end does not support push options", re.MULTILINE)
 _LINK = re.compile(r"https?://\S+")
 
 
@@ -60,23 +59,14 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        if self._remote is None:
-            repo = Repository(self._repository.objects.path)
-            names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
-            # another process may delete a branch meanwhile, so a name may have no reference
-            pairs = ((name, repo.references.get(name)) for name in [MAIN, *names])
-            commits = {name: str(ref.target) for name, ref in pairs if ref is not None}
-        else:
-            commits = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
+        commits = self._repository.list_references(MAIN, f"{_HEADS}{PREFIX}*")
         heads = {name.removeprefix(_HEADS): commit for name, commit in commits.items()}
         return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
 
     def exists(self, branch: str) -> bool:
         # any branch, also one that does not begin with ``demand/``
         reference = f"{_HEADS}{branch}"
-        if self._remote is None:
-            return reference in self._repository.objects.references
-        return reference in self._remote.list_references(reference)
+        return reference in self._repository.list_references(reference)
 
     def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
         """Make a branch point to ``commit``, durably, and return the link that the server printed.
@@ -110,22 +100,21 @@ class ProposalBranches:
             except (GitError, OSError) as error:
                 raise self._why_denied(branch) or error from None
             return ""
-        try:
-            spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
-            output = self._remote.push(spec, lease, options)
-            lines = [line for line in output.splitlines() if line.startswith("remote:")]
+        spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
+        pushed = self._remote.push(spec, lease, options)
+        if pushed.took(reference):
+            lines = [line for line in pushed.err.splitlines() if line.startswith("remote:")]
             links = [link[0] for line in lines if (link := _LINK.search(line))]
             # GitLab prints how to make a merge request, or the one that exists
             return next((link for link in links if "/merge_requests/" in link), "")
-        except git.GitCommandError as error:
-            if options and _NO_OPTIONS.search(str(error.stderr)):
-                return self._move(branch, commit, expected)
-            now = self.heads().branches.get(branch, "")
-            if now == wanted:
-                return ""  # the push succeeded, but the answer was lost
-            if now != expected:
-                raise BranchMoved(branch) from None
-            raise self._why_denied(branch) or self._remote.push_error(error) from None
+        if options and _NO_OPTIONS.search(pushed.err):
+            return self._move(branch, commit, expected)
+        now = self.heads().branches.get(branch, "")
+        if now == wanted:
+            return ""  # the push succeeded, but the answer was lost
+        if now != expected:
+            raise BranchMoved(branch)
+        raise self._why_denied(branch) or self._remote.push_error(pushed, reference)
 
     def _why_denied(self, branch: str) -> PushDenied | None:
         folders = (branch[:end] for end, letter in enumerate(branch) if letter == "/")

@@ -62,6 +62,9 @@ _MOST_TOLD = 20  # faults in the comment on a pull request
 
 # How many seconds a check of all proposals may take before it pauses for a queued demand.
 _LONGEST_CHECK_S = 0.5
+# How long a branch is tried again that the server does not take, if it says nothing itself: then
+# the connection may have failed.
+_REFUSAL_PATIENCE_S = 120.0
 
 RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
@@ -223,10 +226,19 @@ class Approvals:
             try:
                 if not proposal.is_unchanged(str(snapshot.commit), heads.branches):
                     self._check(proposal, snapshot, heads)
+                    proposal.refused_from = None
             except BranchMoved as error:
                 log.info("%s; checking again", error)
                 self._changed.append(proposal.branch)
             except (SigningFailed, PushDenied) as error:
+                if isinstance(error, PushDenied) and not error.is_verdict:
+                    now = self._runtime.monotonic()
+                    if proposal.refused_from is None:
+                        proposal.refused_from = now
+                        log.warning("%s; trying again for some time", error)
+                    if now - proposal.refused_from < _REFUSAL_PATIENCE_S:
+                        self._changed.append(proposal.branch)
+                        continue
                 # while the branch exists, a person can still merge it
                 if proposal.tickets and proposal.branch in heads.branches:
                     self._runtime.failed(f"rebuilding {proposal.branch}", error)

@@ -52,6 +52,7 @@ class Proposal:
     searched_to: str = ""  # up to this commit, main was searched for merged demands
     checked_at: str = ""  # main at the last check; empty to check again
     edited: bool = False  # by a person who committed to the branch
+    refused_from: float | None = None  # since when the server does not take the branch
 
     @property
     def branch(self) -> str:
