@@ -14,7 +14,6 @@ import re
 import shutil
 import signal
 import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -385,49 +384,51 @@ class RemoteRepository(repositories.StateRepository):
     ) -> GitResult:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
-        with tempfile.NamedTemporaryFile("r", prefix="demandops-", errors="replace") as http:
-            trace = {"GIT_TRACE_CURL": http.name, "GIT_TRACE_CURL_NO_DATA": "1"}
-            process = subprocess.Popen(
-                [*child_processes.git(self._folder), *command],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                cwd=self._folder.parent,
-                env=os.environ | child_processes.git_environment() | trace,
-                start_new_session=True,
-            )
-            self._process = process
-            if self._aborted:  # another thread has called abort since the first check
-                self.abort()
-            start, told = REAL.monotonic(), 0
-            try:
-                while True:
-                    with suppress(subprocess.TimeoutExpired):
-                        out, err = process.communicate(timeout=_POLL_S)
-                        break
-                    took = REAL.monotonic() - start
-                    if int(took) > told:
-                        told, doing = int(took), _DOING.get(command[0], "asking")
-                        slow_git.tell(f"{doing} {self.address}, {told} s")
-                    self.while_waiting()
-                    if urgent():
-                        raise FetchInterrupted("the fetch was interrupted by a demand")
-                    if took >= timeout:
-                        out, err = _terminate(process)
-                        break
-            finally:
-                if process.returncode is None:
-                    _terminate(process)
-                self._process = None
-                if told:
-                    slow_git.tell("")
-            texts = [text.decode("utf-8", "replace") for text in (out, err)]
-            code, took = process.returncode, REAL.monotonic() - start
-            if code < 0:
-                ended = f"was ended by signal {-code}"
-                ended = f"timed out after {timeout:g} s" if took >= timeout else ended
-                texts[1] += f"\nfatal: git {ended}"
-            return GitResult(code, texts[0], texts[1], http.read(), took)
+        trace = self._folder.with_name("http.trace")  # git leaves credentials out of it
+        trace.unlink(missing_ok=True)
+        tracing = {"GIT_TRACE_CURL": str(trace), "GIT_TRACE_CURL_NO_DATA": "1"}
+        process = subprocess.Popen(
+            [*child_processes.git(self._folder), *command],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            cwd=self._folder.parent,
+            env=os.environ | child_processes.git_environment() | tracing,
+            start_new_session=True,
+        )
+        self._process = process
+        if self._aborted:  # another thread has called abort since the first check
+            self.abort()
+        start, told = REAL.monotonic(), 0
+        try:
+            while True:
+                with suppress(subprocess.TimeoutExpired):
+                    out, err = process.communicate(timeout=_POLL_S)
+                    break
+                took = REAL.monotonic() - start
+                if int(took) > told:
+                    told, doing = int(took), _DOING.get(command[0], "asking")
+                    slow_git.tell(f"{doing} {self.address}, {told} s")
+                self.while_waiting()
+                if urgent():
+                    raise FetchInterrupted("the fetch was interrupted by a demand")
+                if took >= timeout:
+                    out, err = _terminate(process)
+                    break
+        finally:
+            if process.returncode is None:
+                _terminate(process)
+            self._process = None
+            if told:
+                slow_git.tell("")
+        texts = [text.decode("utf-8", "replace") for text in (out, err)]
+        code, took = process.returncode, REAL.monotonic() - start
+        if code < 0:
+            ended = f"was ended by signal {-code}"
+            ended = f"timed out after {timeout:g} s" if took >= timeout else ended
+            texts[1] += f"\nfatal: git {ended}"
+        http = trace.read_text(errors="replace") if trace.exists() else ""
+        return GitResult(code, texts[0], texts[1], http, took)
 
     def abort(self) -> None:
         self._aborted = True
