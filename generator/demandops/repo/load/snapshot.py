@@ -251,17 +251,19 @@ class Followed:
         return bool(self.change.files) or now.told != (now.refused if now.faults else None)
 
 
+def newest_of_generator(repo: Repository, tip: Oid) -> LogEntry | None:
+    by_generator = (c for c in repo.walk(tip) if commit_log.is_by_generator(repo, c))
+    return next(map(commit_log.entry_of, by_generator), None)
+
+
 def start_at(repo: Repository, tip: Oid, progress: Progress = lambda done, total: None) -> Snapshot:
     """Return what the newest commit of a generator has in effect, else the tip if it is valid."""
     told: InvalidInput | StateRepoError | None = None
-    for commit in repo.walk(tip):
-        if commit_log.is_by_generator(repo, commit):
-            # it may be forged, or of a newer program
-            try:
-                return load(repo, commit.id, progress, commit_log.entry_of(commit))
-            except (InvalidInput, StateRepoError) as error:
-                told = error
-            break
+    if (entry := newest_of_generator(repo, tip)) is not None:
+        try:  # it may be forged, or of a newer program
+            return load(repo, entry.commit, progress, entry)
+        except (InvalidInput, StateRepoError) as error:
+            told = error
     try:
         return replace(load(repo, tip, progress), is_rendered=False)
     except (InvalidInput, StateRepoError) as error:

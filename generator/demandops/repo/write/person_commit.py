@@ -159,14 +159,21 @@ def _commit(
 
 
 def _require_valid(repository: StateRepository, tip: Commit) -> None:
+    objects = repository.objects
     try:
-        held = snapshots.state_at(repository.objects, tip.id)
+        entry = snapshots.newest_of_generator(objects, tip.id)
+        snapshots.config_at(tip.tree)
+        if entry is None or not entry.first(snapshots.CONFIGURATION):
+            return
     except InvalidInput:
-        return  # there is no generator yet, or no state in effect: the new files alone are judged
+        pass
+    try:
+        held = snapshots.state_at(objects, tip.id)
+    except InvalidInput:
+        return  # nothing is in effect yet, so the new files alone are judged
     if held.faults:
-        problem = snapshots.problems_of(repository.objects, held)[0]
         raise StateRepoError(
             f"nothing of {MAIN_BRANCH}'s configuration is in effect, because it is not valid, so "
-            f"nothing was changed; first {snapshots.how_to_mend(repository.objects, held)}: "
-            f"{problem}"
+            f"nothing was changed; first {snapshots.how_to_mend(objects, held)}: "
+            f"{snapshots.problems_of(objects, held)[0]}"
         )
