@@ -30,13 +30,13 @@ from demandops.model.ledger.claim import Claim, path_of, text_of
 from demandops.model.ledger.records import WaitingDemand
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.load import snapshot
-from demandops.repo.write import journal
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.proposal_branch import ProposalBranches
-from demandops.serve import agenda, demands
-from demandops.serve.agenda import Draining, LeaseExpiry, WaitingTurns
+from demandops.serve import agenda, journal
+from demandops.serve.agenda import Agenda
 from demandops.serve.approvals.approvals import Approvals
-from demandops.serve.demands import Demands, Receipt, Ticket
+from demandops.serve.demands import Demands
+from demandops.serve.journal import Receipt, Ticket
 from demandops.serve.worker import Worker
 
 Wrong = Callable[..., Any]
@@ -137,9 +137,7 @@ def take_back_promised_leases(_: Any, lease: Any, term: Any, now: Any) -> Any:
 plant("lose_renewals", 2, Lease, "renewed", itself)
 
 
-@wrong(11, LeaseExpiry, "_has_ended")
-def end_leases_by_the_wall_clock(_: Any, expiry: Any, claim: Any, now: Any) -> bool:
-    return claim.lease is not None
+plant("end_leases_by_the_wall_clock", 11, Agenda, "_has_grace", lambda *_: False)
 
 
 plant("never_scale", 8, planner, "_replicas_of", lambda _, scaling, *more: scaling.min)
@@ -221,10 +219,9 @@ def begin_the_wait_anew(
     return request and replace(request, waiting=replace(request.waiting, since=now))
 
 
-plant("forget_those_that_wait", 6, WaitingTurns, "is_due", nothing)
-plant("let_others_overtake_in_a_batch", 34, WaitingTurns, "follow", nothing)
-plant("leave_drained_nodes_full", 8, Draining, "is_due", nothing)
-plant("leave_drained_nodes_full", 8, Draining, "move_due", nothing)
+plant("forget_those_that_wait", 6, Agenda, "may_have_room", nothing)
+plant("let_others_overtake_in_a_batch", 34, Agenda, "book_those_let_in", nothing)
+plant("leave_drained_nodes_full", 8, agenda, "_to_drain", lambda *_: [])
 plant("place_on_drained_nodes", 1, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 5, placement, "_booked", nothing)
 plant("count_no_room", 2, capacity, "excesses", lambda *_: [])
@@ -393,10 +390,13 @@ _known = set[str]()
 """The demands whose proposals a generator has forgotten at a restart."""
 
 
-def _forget_proposal(resumed: Any, record: Any) -> Ticket:
-    if record.get("proposal"):
-        _known.add(record["goal"].get("demand", ""))
-    return resumed({key: value for key, value in record.items() if key != "proposal"})
+def _forget_proposal(read: Any, path: Any) -> dict[str, Ticket]:
+    found = read(path)
+    for ticket in found.values():
+        if ticket.proposal:
+            _known.add(ticket.demand.goal.get("demand", ""))
+            ticket.proposal, ticket.state = None, "committed"
+    return found
 
 
 @wrong(6, permission, "approval_reasons")
@@ -404,6 +404,4 @@ def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> tup
     return () if request.demand in _known else reasons(request, *more)
 
 
-FAULTS["skip_approval_after_a_restart"].parts.append(
-    (demands, "ticket_from_journal", _forget_proposal)
-)
+FAULTS["skip_approval_after_a_restart"].parts.append((journal, "read", _forget_proposal))

@@ -22,7 +22,7 @@ from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
 from demandops.repo.git.signing import Signer
 from demandops.repo.upgrade import Upgrade, UpgradeRequest
-from demandops.repo.write.journal import find_journals
+from demandops.serve.journal import find_journals
 from demandops.templating.evaluator import processor_time
 
 # ---- ``demandops init``: a new state repo ----
@@ -362,11 +362,11 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
     for each in journals:
         demands = [
             {
-                "operation_id": record["operation"],
-                "received": record["received"],
-                "goal": record["goal"],
+                "operation_id": ticket.operation,
+                "received": ticket.received.isoformat(),
+                "goal": ticket.demand.goal,
             }
-            for record in each.demands
+            for ticket in each.demands
         ]
         rows.append(
             {
@@ -377,7 +377,7 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
             }
         )
         lines += [
-            f"{record['operation']}  received {record['received']}" for record in each.demands
+            f"{ticket.operation}  received {ticket.received.isoformat()}" for ticket in each.demands
         ]
         if each.set_aside:
             lines.append(f"the damaged journal {each.file} is now called {each.set_aside}")

@@ -29,8 +29,8 @@ from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
 from demandops.repo.load import last_valid_config, ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress, Snapshot
+from demandops.repo.slot import Slot
 from demandops.repo.verification import Verdict
-from demandops.repo.write.journal import Slot
 
 
 class Reader:

@@ -20,10 +20,11 @@ from demandops.repo.git.signing import Signer
 from demandops.repo.history import revisions
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress, Snapshot
-from demandops.repo.write.journal import Slot
+from demandops.repo.slot import Slot
 from demandops.serve.agenda import heartbeat_in
 from demandops.serve.approvals.approvals import Approvals
-from demandops.serve.demands import Demands, Listener, Ticket
+from demandops.serve.demands import Demands
+from demandops.serve.journal import Listener, Ticket, open_journal
 from demandops.serve.worker import RemoteStatus, Worker
 
 log = logging.getLogger("demandops")
@@ -63,6 +64,10 @@ class Generator:
         except OSError as error:
             raise access_error(error, f"the data folder of {state_repo}") from None
         try:
+            try:
+                self._journal = open_journal(self._slot.folder)
+            except OSError as error:
+                raise access_error(error, f"the data folder of {state_repo}") from None
             repository = connect(
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
@@ -80,7 +85,7 @@ class Generator:
             raise
         self._repository, self._runtime = repository, runtime
         self.address = repository.address
-        self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime)
+        self._demands = Demands(self._journal, queue_limit, requester_limit, runtime)
         token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,
@@ -150,7 +155,7 @@ class Generator:
             message = f"{operation!r} is not an operation id; use at most 100 letters, digits, "
             message += "dashes, dots and underscores"
             raise ValueError(message)
-        ticket = Ticket(operation, _UNREAD, self._runtime.now(), listener)
+        ticket = Ticket(operation, _UNREAD, self._runtime.now(), listener=listener)
         limits = self.snapshot.state.config.repo_settings.limits
         try:
             # here, so that what cannot be read is not journaled, and does not wait in the queue
@@ -193,6 +198,7 @@ class Generator:
                 finished.set_result(False)
                 return
             unpublished = self._demands.unpublished
+            self._journal.close()
             self._slot.close()
             finished.set_result(not unpublished)
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 from demandops.serve import worker
-from demandops.serve.demands import Ticket
 from demandops.serve.generator import Generator
+from demandops.serve.journal import Ticket
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock

@@ -11,8 +11,8 @@ from random import Random
 
 import pytest
 from demandops.model.demand import goals as demand_goals
-from demandops.repo.write.journal import DamagedJournal
 from demandops.serve.generator import Generator
+from demandops.serve.journal import DamagedJournal
 
 from tests.kit import rig
 from tests.kit.cli import Run

@@ -28,8 +28,8 @@ from demandops.repo import reader
 from demandops.repo.history import commit_log
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
-from demandops.serve.demands import Receipt
 from demandops.serve.generator import Generator
+from demandops.serve.journal import Receipt
 
 # ---- booking, and printing the changes ----
 

@@ -30,8 +30,8 @@ from demandops.decide.decision import decide
 from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
 from demandops.serve.approvals.proposal import parse_waiting_text
-from demandops.serve.demands import Receipt
 from demandops.serve.generator import Generator
+from demandops.serve.journal import Receipt
 
 
 @dataclass(frozen=True, slots=True)
