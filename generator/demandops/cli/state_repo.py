@@ -22,6 +22,7 @@ from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
 from demandops.repo.git.signing import Signer
 from demandops.repo.upgrade import Upgrade, UpgradeRequest
+from demandops.serve.journal import drop as drop_demand
 from demandops.serve.journal import find_journals
 from demandops.templating.evaluator import processor_time
 
@@ -342,24 +343,34 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     help="Rename journals that are damaged, so that the generator starts without them. A journal "
     "that a running generator uses keeps its name.",
 )
+@click.option(
+    "--drop",
+    metavar="ID",
+    help="Give up the demand with this operation id. If a generator runs, it answers the demand's "
+    "requester.",
+)
 @output_option
-def journal(state_repo: str, set_aside: bool, output: str) -> None:
+def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> None:
     """List the accepted demands that are not published.
 
     A generator on this machine accepted these demands. If it still runs, it carries them out.
     Otherwise the next generator that starts here for the state repo does. If a journal is damaged,
     no generator starts, because the journal may lack demands. In this case, use --set-aside, and
-    send again the listed demands that are still needed. --output json prints their goals.
+    send again the listed demands that are still needed. --output json prints their goals. A demand
+    that shall not be carried out is given up with --drop.
 
     \b
     Examples:
       demandops journal
       demandops journal --set-aside
+      demandops journal --drop 5e0c1b0e-6d7f-4a39-9d4f-0f6f0c1f7a52
     """
     folder = settings.data_home(state_repo)
-    journals = list(find_journals(folder, REAL.now(), set_aside=set_aside))
+    if drop is not None:
+        _drop(folder, drop, output)
+        return
     rows, lines = [], []
-    for each in journals:
+    for each in find_journals(folder, REAL.now(), set_aside=set_aside):
         demands = [
             {
                 "operation_id": ticket.operation,
@@ -376,16 +387,32 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
                 "demands": demands,
             }
         )
-        lines += [
-            f"{ticket.operation}  received {ticket.received.isoformat()}" for ticket in each.demands
-        ]
+        lines += [f"{demand['operation_id']}  received {demand['received']}" for demand in demands]
         if each.set_aside:
             lines.append(f"the damaged journal {each.file} is now called {each.set_aside}")
-    number = sum(len(each.demands) for each in journals)
+        elif each.damage:
+            errors.print(f"error: {each.damage}")
+    number = sum(len(row["demands"]) for row in rows)
     what = "demand is" if number == 1 else "demands are"
     show(output, rows, [*lines, f"{number} {what} accepted and not published"])
-    damages = [each.damage for each in journals if each.damage and not each.set_aside]
-    for damage in damages:
-        errors.print(f"error: {damage}")
-    if damages:
+    if any(row["faults"] and not row["set_aside"] for row in rows):
         raise click.exceptions.Exit(1)
+
+
+_DROP_S = 15.0
+
+
+def _drop(folder: Path, operation: str, output: str) -> None:
+    request, end = drop_demand(folder, operation), REAL.monotonic() + _DROP_S
+    while request and request.exists() and REAL.monotonic() < end:
+        REAL.sleep(0.1)
+    outcome = "dropped" if not request else "requested" if request.exists() else "answered"
+    text = {
+        "dropped": "is given up; if its generator died after the push, it is booked, which "
+        "`demandops log` shows",
+        "answered": "has its answer from the generator that runs, whose log has it too",
+        "requested": "is given up by the generator that runs as soon as the state repo shows that "
+        "no push of it has arrived",
+    }
+    data = {"operation_id": operation, "outcome": outcome}
+    show(output, data, [f"demand {operation} {text[outcome]}"])

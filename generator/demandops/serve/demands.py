@@ -136,7 +136,7 @@ class FairQueue:
 TAKEN_BACK = "the demand was taken back before it was committed"
 GIVEN_UP = "the demand was given up by `demandops journal --drop`"
 # The seconds between two looks for such requests.
-_LOOK_S = 2.0
+_LOOK_S = 1.0
 
 _NEXT: dict[State, tuple[State, ...]] = {
     "arrived": ("queued", "done"),

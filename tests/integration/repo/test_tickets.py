@@ -272,7 +272,7 @@ def test_an_operation_id_of_a_demand_that_has_no_answer_yet_is_refused(
 def test_a_bug_in_the_journal_leaves_no_demand_without_an_answer(
     generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Ticket, "record", lambda ticket: {"goal": object()})
+    monkeypatch.setattr(Ticket, "as_data", lambda ticket: {"goal": object()})
     for ticket in [generator.submit(goal(number)) for number in (1, 2)]:
         assert "internal error" in str(ticket.future.exception(rig.PATIENCE_S))
     monkeypatch.undo()
