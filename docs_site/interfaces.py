@@ -31,8 +31,8 @@ def page() -> str:
 
 def _parameters() -> str:
     rows = ["| parameter | default | meaning |", "| --- | --- | --- |"]
-    for name, default in node_parameters.DEFAULTS.items():
-        told = node_parameters.descriptor(name)
+    for name, parameter in node_parameters.PARAMETERS.items():
+        told, default = parameter.descriptor(), parameter.default
         ranges = [
             f"{one.from_value:g} to {one.to_value:g}"
             for one in (*told.floating_point_range, *told.integer_range)

@@ -12,7 +12,7 @@ from demandops.base.runtime import REAL
 from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops.base.strict_yaml import read_input
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import errors
+from demandops.cli.output import done, errors
 from demandops.model.config.base_model import duration_text
 
 from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
@@ -97,6 +97,7 @@ def _print_answer(answer: Answer, output: str) -> None:
     }
     lease = f", for {duration_text(answer.lease_s)} unless renewed" if answer.lease_s else ""
     commit = f" in {answer.commit}" if answer.commit else ""
+    done.append(f"{answer.outcome}{commit}")
     show(output, data, [f"{answer.outcome}{commit}{lease}"])
     for warning in answer.warnings if output == "text" else ():
         errors.print(f"warning: {warning}")
@@ -104,7 +105,7 @@ def _print_answer(answer: Answer, output: str) -> None:
 
 def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
     over = REAL.event()
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
     client.requesters = tuple(data.get("requesters", ()))
     goal, on_stage = {**data, "operation": "put"}, _print_stages(output)

@@ -53,11 +53,17 @@ class ExecutorThread:
             self._executor.shutdown(timeout_sec=0)
 
 
+def stop_numbers() -> list[signal.Signals]:
+    # a closed terminal stops a node too, unless `nohup` started it
+    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+
+
 @contextmanager
 def stop_signals() -> Iterator[Callable[[], None]]:
     # a function that waits for Ctrl-C or SIGTERM; after it, a further one ends the process at once
     over = REAL.event()
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers = stop_numbers()
     before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
 
     def wait() -> None:
@@ -99,20 +105,28 @@ def started(arguments: Sequence[str]) -> Iterator[list[str]]:
         raise click.UsageError(
             f"unexpected argument {ros_args[0]}; ROS arguments follow --ros-args"
         )
-    if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
+    home = os.environ.get("ROS_HOME") or os.environ.get("HOME") or ""
+    if not (os.environ.get("ROS_LOG_DIR") or os.access(home, os.W_OK)):
         # ROS's log library does not start in a container without a home folder
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     try:
         no_signals = SignalHandlerOptions.NO
         rclpy.init(args=["demandops", *ros_args], signal_handler_options=no_signals)
     except Exception as error:  # rclpy raises errors of many kinds
+        message = one_line(str(error))
         if not ros_args:
-            raise
+            raise click.ClickException(f"ROS does not start: {message}") from None
         raise click.UsageError(
-            f"ROS does not start with the arguments after --ros-args: {one_line(str(error))}"
+            f"ROS does not start with the arguments after --ros-args: {message}"
         ) from None
     try:
         yield ros_args
+    except Exception as error:
+        if not ros_args or type(error).__module__.partition(".")[0] not in ("rclpy", "_rclpy"):
+            raise
+        raise click.UsageError(
+            f"ROS does not take the arguments after --ros-args: {one_line(str(error))}"
+        ) from error
     finally:
         rclpy.try_shutdown()
 

@@ -182,10 +182,8 @@ def _run(
         status,
         ignores_ids=settings["deployment_request_ids"] == "ignore",
     )
-    for name, value in settings.items():
-        shown = generator.address if name == "state_repo" else value
-        # read-only, because a later change would have no effect
-        node.declare_parameter(name, shown, node_parameters.descriptor(name, read_only=True))
+    shown = settings | {"state_repo": generator.address}
+    node_parameters.declare(node, node_parameters.PARAMETERS, shown)
     ros_process.log_to(node.get_logger(), settings["log_level"])
     # the node runs in another thread, so that the main thread notices a signal at once
     thread = ros_process.ExecutorThread(node)
@@ -222,8 +220,7 @@ class _Signals:
         self._woken = REAL.event()
 
     def __enter__(self) -> _Signals:
-        numbers = (signal.SIGINT, signal.SIGTERM)
-        self._before = {number: signal.signal(number, self._handle) for number in numbers}
+        self._before = {n: signal.signal(n, self._handle) for n in ros_process.stop_numbers()}
         REAL.when_unsound = self.wake
         return self
 

@@ -5,11 +5,12 @@ Functions that need `rich` import it themselves, because `demandops --help` impo
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -39,6 +40,48 @@ def console(stderr: bool = False) -> Console:
     width = None if stream.isatty() else 200
     # rich would take [bold] and :smile: in the texts of people for its own markup
     return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
+
+
+# What the command has changed already, to be told if its output cannot be written.
+done: list[str] = []
+
+
+class OutputLost(Exception):
+    """Raised when the standard output is closed or full; no library catches it by chance."""
+
+
+class _Output(io.TextIOWrapper):
+    def write(self, text: str, /) -> int:
+        try:
+            return super().write(text)
+        except OSError as error:
+            raise OutputLost(error.strerror) from error
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except OSError as error:
+            raise OutputLost(error.strerror) from error
+
+
+def open_streams() -> None:
+    """Give the process three standard streams, of which none raises an error of its encoding."""
+    # The next file would get the number of a closed one, and what a child prints would land in it.
+    # What is opened for reading refuses each write, and so tells that the output was closed.
+    for number, mode in enumerate((os.O_RDONLY, os.O_RDONLY, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, mode)
+    sys.stdin = sys.stdin or open(0, closefd=False)  # noqa: SIM115
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
+    stream = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
+    assert isinstance(stream, io.TextIOWrapper)  # noqa: S101
+    assert isinstance(sys.stderr, io.TextIOWrapper)  # noqa: S101
+    encoding, is_terminal = stream.encoding, stream.isatty()
+    raw = stream.detach()
+    sys.stdout = _Output(raw, encoding, "backslashreplace", line_buffering=is_terminal)
+    sys.stderr.reconfigure(errors="backslashreplace")
 
 
 # What is printed before the name of a changed release or entry.
@@ -72,7 +115,8 @@ def print_lines(lines: list[str]) -> None:
 
 class _Errors:
     def print(self, text: str) -> None:
-        click.echo(quoting.lines(text), err=True)
+        with suppress(OSError):  # nothing else can tell it
+            click.echo(quoting.lines(text), err=True)
 
 
 errors = _Errors()

@@ -16,7 +16,7 @@ from demandops.base.runtime import REAL
 from demandops.cli import target
 from demandops.cli.authoring import schema
 from demandops.cli.json_output import Json, output_option, show
-from demandops.cli.output import Progress, busy, errors, progress
+from demandops.cli.output import Progress, busy, done, errors, progress
 from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
@@ -101,6 +101,7 @@ def init(
             schemas={name: schema.text(name) for name in schema.SCHEMAS},
             signer=Signer(signing_key) if signing_key else None,
         )
+    done.append(f"state repo in {directory}")
     data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
     lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
     if not url:
@@ -198,6 +199,7 @@ def upgrade(
     if not dry_run:
         with _shown() as report:
             result = upgrading.upgrade(state_repo, request, now, report, signer)
+            done.append(f"upgraded in {result.commit}")
     old, new = result.old.repo_settings, result.new.repo_settings
     outcome = "unchanged" if not result.files else "would-change" if dry_run else "upgraded"
     data = {
@@ -369,8 +371,9 @@ def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> 
     if drop is not None:
         _drop(folder, drop, output)
         return
+    journals = list(find_journals(folder, REAL.now(), set_aside=set_aside))
     rows, lines = [], []
-    for each in find_journals(folder, REAL.now(), set_aside=set_aside):
+    for each in journals:
         demands = [
             {
                 "operation_id": ticket.operation,
@@ -392,10 +395,10 @@ def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> 
             lines.append(f"the damaged journal {each.file} is now called {each.set_aside}")
         elif each.damage:
             errors.print(f"error: {each.damage}")
-    number = sum(len(row["demands"]) for row in rows)
+    number = sum(len(each.demands) for each in journals)
     what = "demand is" if number == 1 else "demands are"
     show(output, rows, [*lines, f"{number} {what} accepted and not published"])
-    if any(row["faults"] and not row["set_aside"] for row in rows):
+    if any(each.damage and not each.set_aside for each in journals):
         raise click.exceptions.Exit(1)
 
 

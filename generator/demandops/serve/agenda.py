@@ -158,7 +158,7 @@ class Agenda:
         waits = [self.waits_s("drain", node) for node in _to_drain(state)]
         for end, name in _ends(state):
             waits.append(max((end - now).total_seconds() + 0.01, self.waits_s("end", name)))
-        return min(waits + [LONGEST_WAIT_S])
+        return min([*waits, LONGEST_WAIT_S])
 
     def commit_due(self, commits: CommitBatch) -> None:
         self._forget_failures(commits.head.state.config)

@@ -15,7 +15,7 @@ from demandops.base.errors import Fault, InvalidInput, Refused
 from demandops.base.runtime import REAL
 from demandops.cli.changes import person_change
 from demandops.cli.json_output import Json, claim_data, faults_of, output_option, show
-from demandops.cli.output import busy, console, errors, progress
+from demandops.cli.output import busy, console, done, errors, progress
 from demandops.cli.queries.diff import release_lines
 from demandops.cli.target import dry_run_option, names_of, signing_option, writable_repo_option
 from demandops.decide.changeset import ReleaseChange
@@ -45,7 +45,9 @@ def booked(generator: Generator, demand: Demand) -> Receipt:
     ticket = generator.submit(demand)
     with busy("booking"):
         await_answer(ticket.future)
-    return ticket.future.result()
+    receipt = ticket.future.result()
+    done.append(f"{receipt.outcome} in {receipt.commit}")
+    return receipt
 
 
 @contextmanager
