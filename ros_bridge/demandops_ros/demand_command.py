@@ -8,14 +8,16 @@ from typing import Any
 import click
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput, fault
+from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops.base.strict_yaml import read_input
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import done, errors
+from demandops.cli.output import done, errors, read_by
 from demandops.model.config.base_model import duration_text
 
 from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
+from demandops_ros.node_parameters import ros_name
 
 
 @click.command()
@@ -28,6 +30,7 @@ from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
     default=DEFAULT_DEMAND_ACTION_NAME,
     show_default=True,
     metavar="NAME",
+    callback=read_by(ros_name),
     help="The name of the node's action Demand.",
 )
 @click.option(
@@ -67,7 +70,11 @@ def demand(
         names = ("demand", "requesters", "request")
         data = {field: value for field, value in data.items() if field in names}
         data["operation"] = "release" if release else "renew"
-    with DemandClient(action_name=action, timeout_s=timeout) as client:
+    try:
+        opened = DemandClient(action_name=action, timeout_s=timeout)
+    except Exception as error:  # rclpy raises errors of many kinds
+        raise click.ClickException(f"ROS does not start: {one_line(str(error))}") from error
+    with opened as client:
         try:
             if hold:
                 _hold(client, data, output)

@@ -168,7 +168,7 @@ def run(args: list[str] | None = None) -> int:
             signal.signal(number, handler)
 
 
-def _run(args: list[str]) -> int:
+def _run(args: list[str]) -> int:  # noqa: PLR0912 - one for each kind of end
     try:
         if odd := [arg for arg in args if any("\udc80" <= char <= "\udcff" for char in arg)]:
             raise click.ClickException(
