@@ -6,6 +6,7 @@ The person is author and committer, so a generator reads the commit like any oth
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -154,7 +155,11 @@ def _commit(
     if new_faults:
         raise InvalidInput(sorted(new_faults, key=str))
     who = commit_message.signature(*details.person, details.now)
-    return repository.new.add_commit(repository.signer, (who, who), details.text, tree, parents)
+    text = details.text
+    with suppress(InvalidInput):
+        if last_valid_config.config_at(tip.tree).repo_settings.signed_off_by:
+            text = commit_message.signed_off(text, f"{who.name} <{who.email}>")
+    return repository.new.add_commit(repository.signer, (who, who), text, tree, parents)
 
 
 def _config_faults(tree: Tree) -> set[Fault]:
