@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import signal
 from typing import Any
 
 import click
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput, fault
 from demandops.base.quoting import one_line
-from demandops.base.runtime import REAL
 from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops.base.strict_yaml import read_input
 from demandops.cli.json_output import output_option, show
@@ -18,6 +16,7 @@ from demandops.model.config.base_model import duration_text
 
 from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
 from demandops_ros.node_parameters import ros_name
+from demandops_ros.ros_process import StopSignals
 
 
 @click.command()
@@ -111,20 +110,14 @@ def _print_answer(answer: Answer, output: str) -> None:
 
 
 def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
-    over = REAL.event()
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
     client.requesters = tuple(data.get("requesters", ()))
     goal, on_stage = {**data, "operation": "put"}, _print_stages(output)
-    with HeldDemand(
-        client, str(data.get("demand", "")), lambda: client.send(goal, on_stage)
-    ) as held:
+    held = HeldDemand(client, str(data.get("demand", "")), lambda: client.send(goal, on_stage))
+    with StopSignals() as signals, held:
         if held.answer is not None:
             _print_answer(held.answer, output)
         if output != "json":
             errors.print("held until Ctrl-C")
-        over.wait()
-    for number, handler in before.items():
-        signal.signal(number, handler)
+        signals.wait()
     if output != "json":
         errors.print("released")

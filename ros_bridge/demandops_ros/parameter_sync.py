@@ -171,7 +171,7 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
     Examples:
       demandops parameter-sync --ros-args --params-file fusion.yaml
     """
-    with ros_process.stop_signals() as wait_for_signal, ros_process.started(ctx.args):
+    with ros_process.StopSignals() as signals, ros_process.started(ctx.args):
         given = read_parameters("parameter_sync", _PARAMETERS, {})
         node = Node("parameter_sync")
         node_parameters.declare(node, _PARAMETERS, given)
@@ -195,7 +195,7 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
 
         watch = ConfigMapWatch(given["namespace"], given["configmap_name"], take, kubeconfig)
         thread = ros_process.ExecutorThread(node)
-        wait_for_signal()
+        signals.wait()
         # the watch first, because it calls the node
         watch.close()
         thread.close()

@@ -10,11 +10,14 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 
 import click
 import rclpy
 from demandops.base.quoting import OneLineFormatter, one_line
 from demandops.base.runtime import REAL
+from demandops.cli.main import ExitCode
+from demandops.cli.output import errors
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.logging import LoggingSeverity, set_logger_level
@@ -53,30 +56,46 @@ class ExecutorThread:
             self._executor.shutdown(timeout_sec=0)
 
 
-def stop_numbers() -> list[signal.Signals]:
-    # a closed terminal stops a node too, unless `nohup` started it
-    numbers = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-    return [number for number in numbers if signal.getsignal(number) is not signal.SIG_IGN]
+class StopSignals:
+    """Handles Ctrl-C, SIGTERM and SIGHUP: the first ends the program in order, the second at once.
 
+    A closed terminal sends SIGHUP, unless `nohup` started the program.
+    """
 
-@contextmanager
-def stop_signals() -> Iterator[Callable[[], None]]:
-    # a function that waits for Ctrl-C or SIGTERM; after it, a further one ends the process at once
-    over = REAL.event()
-    numbers = stop_numbers()
-    before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
+    def __init__(self) -> None:
+        self.stopping = False
+        self._woken = REAL.event()
 
-    def wait() -> None:
-        while not over.wait(0.2):  # poll, because another thread may get the signal
-            pass
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
+    def __enter__(self) -> StopSignals:
+        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        self._before = {
+            number: signal.signal(number, self._handle)
+            for number in numbers
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
+        }
+        return self
 
-    try:
-        yield wait
-    finally:
-        for number, handler in before.items():
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
             signal.signal(number, handler)
+
+    def wait(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Wait until a signal comes or ``until()`` is true, which each :meth:`wake` checks."""
+        while not (self.stopping or until() or REAL.unsound):
+            self._woken.wait(0.2)  # poll, because another thread may get the signal
+            self._woken.clear()
+        if REAL.unsound is not None:
+            errors.print(f"error: {REAL.unsound}")
+            os._exit(ExitCode.PROGRAM_ERROR)  # an orderly exit could answer goals
+
+    def wake(self) -> None:
+        self._woken.set()
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.stopping:
+            errors.print("stopped at once")
+            os._exit(ExitCode.INTERRUPTED)
+        self.stopping = True
 
 
 class RosLogHandler(logging.Handler):

@@ -350,7 +350,7 @@ class Oracle:
         assert not left, f"not answered: {left}"
         for machine in self.world.machines:
             assert machine.generator is not None
-            assert machine.generator.operations == (), "the journal has demands"
+            assert machine.generator._demands._tickets == {}, "the journal has demands"
             snapshot = machine.generator.snapshot
             assert str(snapshot.commit) == tip, f"{machine.name} is behind"
             known = claims_of(snapshot.state.ledger)

@@ -168,7 +168,7 @@ def run(args: list[str] | None = None) -> int:
             signal.signal(number, handler)
 
 
-def _run(args: list[str]) -> int:  # noqa: PLR0912 - one for each kind of end
+def _run(args: list[str]) -> int:
     try:
         if odd := [arg for arg in args if any("\udc80" <= char <= "\udcff" for char in arg)]:
             raise click.ClickException(
@@ -193,13 +193,10 @@ def _run(args: list[str]) -> int:  # noqa: PLR0912 - one for each kind of end
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")
         return ExitCode.USER_ERROR
-    except Unsound as error:
-        errors.print(f"error: {error}")
-        return ExitCode.PROGRAM_ERROR
     except DemandOpsError as error:
         for fault in error.faults if isinstance(error, InvalidInput) else [error]:
             errors.print(f"error: {fault}")
-        return ExitCode.USER_ERROR
+        return ExitCode.PROGRAM_ERROR if isinstance(error, Unsound) else ExitCode.USER_ERROR
     except OutputLost as error:
         if not done and isinstance(error.__cause__, BrokenPipeError):  # `demandops log | head`
             return ExitCode.DONE

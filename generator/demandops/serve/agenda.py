@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import suppress
@@ -108,19 +107,21 @@ class Agenda:
         self._tried: World | None = None
         self.left: list[str] = []  # waiting demands that the last round left for later
 
-    def due_in(self, state: State, main: str) -> dict[What, float]:
-        # in seconds; ``main`` is empty if no proposal awaits approval
+    def due_in(self, state: State, main: str, *, has_news: bool = False) -> dict[What, float]:
+        # in seconds; ``main`` is empty if no proposal awaits approval, and ``has_news`` says
+        # whether one was changed
         now, rest = self._runtime.monotonic(), self.waits_s("all")
         fetch = max(self._fetch_at - now, self.waits_s("fetch"))
         if self._requested.is_set():
             fetch = min(fetch, self._fetched_at + _SHORTEST_GAP_S - now)
-        check = self._check_at if main else inf
+        check = (now if has_news else self._check_at) if main else inf
         if main and self._checked != main:
             check = min(check, self._check_new_main_at)
         due: dict[What, float] = {
             "leases": self._lease_ends_in(state.ledger),
             "own work": max(self._own_work_in(state), self.waits_s("own work")),
             "fetch": fetch,
+            # after a failure, the remote is likely away
             "check": max(check - now, self.waits_s("check")),
         }
         return {what: max(seconds, rest, 0.0) for what, seconds in due.items()}
@@ -339,12 +340,6 @@ class Agenda:
 
     # ---- checks of the proposals ----
 
-    def check_is_due(self, main: str, *, has_news: bool) -> bool:
-        now = self._runtime.monotonic()
-        is_new = self._checked != main and now >= self._check_new_main_at
-        is_due = has_news or is_new or now >= self._check_at
-        return is_due and not self.waits_s("check")  # after a failure, the remote is likely away
-
     def check_begins(self) -> None:
         self._check_began = self._runtime.monotonic()
         self.failed("check", first=self._check_interval)  # unless it ends
@@ -451,7 +446,8 @@ _WINDOW = timedelta(minutes=1)
 
 class RateLimit:
     def __init__(self) -> None:
-        self._seen: dict[tuple[str, str], deque[tuple[datetime, str]]] = {}
+        # by domain and requester: the operations of the last minute, with their times
+        self._seen: dict[tuple[str, str], dict[str, datetime]] = {}
 
     def faults(
         self, request: Demand, config: Config, operation: str, received: datetime
@@ -474,22 +470,20 @@ class RateLimit:
                     yield fault("", message, code="quota")
 
     def _count(self, key: tuple[str, str], operation: str, received: datetime) -> int:
+        # by the distance of times, because the clock may have been set back
+        recent = {
+            earlier: at
+            for earlier, at in self._seen.pop(key, {}).items()
+            if abs(received - at) <= _WINDOW
+        }
+        recent.setdefault(operation, received)  # one that is evaluated again keeps its number
+        self._seen[key] = recent  # at the end, so that the requester that is idle longest is first
         # forget requesters that sent nothing for a minute, because vehicles come and go
-        while self._seen:
-            idlest = next(iter(self._seen))
-            if (times := self._seen[idlest]) and abs(received - times[-1][0]) <= _WINDOW:
-                break
+        idlest = next(iter(self._seen))
+        while all(abs(received - at) > _WINDOW for at in self._seen[idlest].values()):
             del self._seen[idlest]
-        seen = self._seen.pop(key, None) or deque()
-        self._seen[key] = seen  # at the end, so that the requester that is idle longest is first
-        while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
-            seen.popleft()
-        # a demand that is evaluated again keeps its number
-        operations = [earlier for _, earlier in seen]
-        if operation in operations:
-            return operations.index(operation) + 1
-        seen.append((received, operation))
-        return len(seen)
+            idlest = next(iter(self._seen))
+        return list(recent).index(operation) + 1
 
 
 # ---- the heartbeat, which a supervisor such as a pod's liveness probe reads ----

@@ -163,6 +163,7 @@ class Demands:
         self._new: list[Ticket] = []
         self._queue = FairQueue(in_order=requester_limit is None)
         for ticket in self._tickets.values():
+            log.info("resuming demand %s from the journal", ticket.operation)
             if ticket.proposal is None:
                 self._enqueue(ticket)
         self._taken_back: list[Ticket] = []
@@ -172,11 +173,6 @@ class Demands:
         self.blocked = ""
 
     # ---- queries ----
-
-    @property
-    def operations(self) -> tuple[str, ...]:
-        with self._changed:
-            return tuple(self._tickets)
 
     @property
     def proposed(self) -> list[Ticket]:

@@ -99,8 +99,6 @@ class Generator:
         self.includes, self.unchanged = repository.includes, repository.unchanged
         self._finished: Future[bool] | None = None
         self._stop_lock = runtime.lock()
-        for operation in self.operations:
-            log.info("resuming demand %s from the journal", operation)
         self._threads = [
             runtime.keep_running("writer", self._worker.run),
             runtime.keep_running("journal", self._demands.journal_arrivals),
@@ -125,10 +123,6 @@ class Generator:
     @property
     def unpublished(self) -> int:
         return self._demands.unpublished
-
-    @property
-    def operations(self) -> tuple[str, ...]:
-        return self._demands.operations
 
     @property
     def failures(self) -> dict[str, str]:

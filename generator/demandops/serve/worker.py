@@ -173,7 +173,7 @@ class Worker:
 
     def _due_in(self) -> dict[What, float]:
         main = str(self.snapshot.commit) if self._approvals.proposals else ""
-        return self._agenda.due_in(self.snapshot.state, main)
+        return self._agenda.due_in(self.snapshot.state, main, has_news=self._approvals.has_news)
 
     def _work(self) -> None:
         batch: list[Ticket] = []
@@ -503,8 +503,7 @@ class Worker:
             self._agenda.failed("own work")
 
     def _check_proposals(self) -> None:
-        main, has_news = str(self.snapshot.commit), self._approvals.has_news
-        if not self._agenda.check_is_due(main, has_news=has_news):
+        if self._due_in()["check"] > 0:
             return
         try:
             self._agenda.check_begins()

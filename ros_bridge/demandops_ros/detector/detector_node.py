@@ -383,32 +383,23 @@ class DetectorNode(Node):  # type: ignore[misc]
 
     def _reload_if_changed(self) -> None:
         # while the file is invalid, the last valid rules stay in effect
+        text = ""
         try:
             _, text = read_input(self._path)
-        except InvalidInput as error:
-            self._text = ""  # any content that is read next counts as changed
-            self._keep_rules(error)
-            return
-        if text == self._text or not self._is_started:
-            return
-        self._text = text
-        try:
+            if text == self._text or not self._is_started:
+                return
             file, _ = _read_rules(self._path)
         except InvalidInput as error:
-            self._keep_rules(error)
+            problems = tuple(map(str, error.faults))
+            for problem in problems if problems != self._problems else ():
+                log.warning("%s; the last valid rules stay in effect", one_line(problem))
+            self._text, self._problems = text, problems
             return
-        self._problems = ()
+        self._text, self._problems = text, ()
         self._sender.want(self._detector.replace_rules(file, self._now(), self._settle_s))
         self._topics.close()
         self._topics = self._subscribe(file)
         log.info("the file has changed; rules: %d", len(file.rules))
-
-    def _keep_rules(self, error: InvalidInput) -> None:
-        problems = tuple(map(str, error.faults))
-        if problems != self._problems:
-            for problem in problems:
-                log.warning("%s; the last valid rules stay in effect", one_line(problem))
-        self._problems = problems
 
     def _report(self) -> None:
         detector, add = self._detector, self._diagnostics.add
