@@ -163,7 +163,7 @@ def move_instances_with_the_channel(separated: Any, app: Any, config: Any) -> An
     return replace(separated(app, config), version=app.version)
 
 
-@wrong(72, completing, "_separated")
+@wrong(127, completing, "_separated")
 def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: Any) -> Any:
     made = separated(app, config)
     return made if made.separate else app

@@ -199,7 +199,7 @@ def upgrade(
     if not dry_run:
         with _shown() as report:
             result = upgrading.upgrade(state_repo, request, now, report, signer)
-            done.append(f"upgraded in {result.commit}")
+            done.extend([f"upgraded in {result.commit}"] if result.files else [])
     old, new = result.old.repo_settings, result.new.repo_settings
     outcome = "unchanged" if not result.files else "would-change" if dry_run else "upgraded"
     data = {

@@ -10,6 +10,7 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from demandops.base import settings
 from demandops.cli import state_repo
 from demandops.model.demand import goals as demand_goals
 from demandops.serve.demands import GIVEN_UP
@@ -321,6 +322,19 @@ def test_the_accepted_demands_are_listed(url: str, bare: Path, demandops: Run) -
     assert demandops("journal", "--state-repo", url).out == (
         "0 demands are accepted and not published\n"
     )
+
+
+def test_a_goal_that_this_version_cannot_read_is_refused_and_stops_no_start(
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    left = [
+        rig.journaled(f"op-{number}", made, "2026-03-01T00:00:00+00:00", rig.tip(bare))
+        for number, made in enumerate([{"colour": "red"}, goal(1)])
+    ]
+    rig.leave_in_journal(settings.data_home(url), *left)
+    assert rig.restart(url)
+    assert re.search(r"demand op-0 .* from the journal: refused: .* colour: is not a field", caplog.text)
+    assert rig.operations(bare) == ["op-1"]
 
 
 def test_a_demand_that_is_dropped_is_not_carried_out_at_the_next_start(

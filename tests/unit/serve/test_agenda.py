@@ -122,6 +122,17 @@ def test_many_requests_give_one_poll_and_one_more_after_it(clock: Clock) -> None
     assert fetch_in(made) == inf
 
 
+def test_what_failed_waits_twice_as_long_each_time_up_to_a_minute(clock: Clock) -> None:
+    made = Agenda(0, clock)
+    for pause in (10, 20, 40, 60, 60):
+        assert made.failed("drain", "edge", first=10) == made.waits_s("drain", "edge") == pause
+        assert made.waits_s("drain", "cloud") == 0
+        clock.pass_(pause)
+        assert made.waits_s("drain", "edge") == 0
+    clock.pass_(60)
+    assert made.failed("drain", "edge", first=10) == 10, "it has not failed for a minute"
+
+
 def test_by_chance_looks_come_earlier_and_never_later() -> None:
     made = Agenda(100, REAL)
     pauses = set()
