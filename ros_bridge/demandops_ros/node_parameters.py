@@ -18,7 +18,7 @@ from demandops.model.config.config import (
     Config,
 )
 from demandops.serve.agenda import DEFAULT_INTERVAL, parse_interval
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
 from rclpy.validate_full_topic_name import validate_full_topic_name
@@ -72,34 +72,25 @@ class Parameter:
 
     def value(self, name: str, given: object) -> Any:  # noqa: ANN401 - of the default's type
         try:
+            kind = type(self.default)
             if self.span is None:
-                value: Any = self.read(given)
-                if self.choices and value not in self.choices:
+                if (value := self.read(given)) not in (self.choices or [value]):
                     raise ValueError(f"takes {', '.join(self.choices)}")
                 return value
-            kinds = (int, float) if isinstance(self.default, float) else (int,)
-            if isinstance(given, bool) or not isinstance(given, kinds):
-                raise ValueError("takes a number" if len(kinds) > 1 else "takes a whole number")
+            if isinstance(given, bool) or not isinstance(given, (int, kind)):
+                raise ValueError("takes a whole number" if kind is int else "takes a number")
             if not self.span[0] <= given <= self.span[1]:
-                raise ValueError(f"takes a number from {self.span[0]:g} to {self.span[1]:g}")
-            return type(self.default)(given)
+                raise ValueError(f"takes a number from {self.limits}")
+            return kind(given)
         except ValueError as error:
             shown = one_line(str(given))
             raise click.UsageError(f"parameter {name} is {shown!r}; it {error}") from None
 
-    def descriptor(self) -> ParameterDescriptor:
-        # read-only, because a later change would have no effect
-        described = ParameterDescriptor(description=self.description, read_only=True)
-        if self.choices:
-            described.additional_constraints = f"one of {', '.join(self.choices)}"
+    @property
+    def limits(self) -> str:
         if self.span is not None:
-            low, high = self.span
-            if isinstance(self.default, float):
-                span = FloatingPointRange(from_value=low, to_value=high)
-                described.floating_point_range = [span]
-            else:
-                described.integer_range = [IntegerRange(from_value=low, to_value=high, step=1)]
-        return described
+            return f"{self.span[0]:g} to {self.span[1]:g}"
+        return f"one of {', '.join(self.choices)}" if self.choices else ""
 
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -135,7 +126,12 @@ def read_parameters(
 
 def declare(node: Node, parameters: Mapping[str, Parameter], values: Mapping[str, Any]) -> None:
     for name, each in parameters.items():
-        node.declare_parameter(name, values[name], each.descriptor(), ignore_override=True)
+        described = ParameterDescriptor(
+            description=each.description,
+            additional_constraints=each.limits,
+            read_only=True,  # because a later change would have no effect
+        )
+        node.declare_parameter(name, values[name], described, ignore_override=True)
 
 
 # ---- the parameters of the reference's node, and warnings about those without effect ----

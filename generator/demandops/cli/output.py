@@ -20,7 +20,6 @@ from demandops.base.runtime import REAL
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress as Bar
     from rich.text import Text
 
 _MOST_LISTED = 3
@@ -201,25 +200,14 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    # a progress bar on a terminal, if the work takes long
+    # on a terminal, how far the work is, if it takes long
     start = REAL.monotonic()
-    bar: Bar | None = None
-    task: Any = None
 
-    def show(done: int, total: int) -> None:
-        nonlocal bar, task
-        if bar is None:
-            if not sys.stderr.isatty() or REAL.monotonic() - start < 0.5 or done >= total:
-                return
-            from rich.progress import Progress as Bar  # noqa: PLC0415
-
-            bar = Bar(console=console(stderr=True), transient=True)
-            task = bar.add_task(title, total=total)
-            bar.start()
-        bar.update(task, completed=done, total=total)
+    def report(done: int, total: int) -> None:
+        if REAL.monotonic() - start >= 0.5:
+            show_slow(f"{title}, {done} of {total}")
 
     try:
-        yield show
+        yield report
     finally:
-        if bar is not None:
-            bar.stop()
+        show_slow("")

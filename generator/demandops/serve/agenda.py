@@ -332,7 +332,8 @@ class Agenda:
         """Plan the next fetch after a fetch or a push, which both tell of others' commits."""
         self._fetched_at = self._runtime.monotonic()
         if reached:
-            self._failed.pop(("fetch", ""), None)
+            for what in ("fetch", "check"):
+                self._failed.pop((what, ""), None)
         elif self._interval:
             self.failed("fetch", first=self._interval)
         if self._interval:

@@ -171,9 +171,9 @@ class Worker:
                 self._work()
         self._approvals.suspend()
 
-    def _due_in(self) -> dict[What, float]:
+    def _due_in(self, *, has_news: bool = False) -> dict[What, float]:
         main = str(self.snapshot.commit) if self._approvals.proposals else ""
-        return self._agenda.due_in(self.snapshot.state, main, has_news=self._approvals.has_news)
+        return self._agenda.due_in(self.snapshot.state, main, has_news=has_news)
 
     def _work(self) -> None:
         batch: list[Ticket] = []
@@ -371,7 +371,7 @@ class Worker:
                 return decision
             # from here on the demand can no longer be taken back
             if not self._demands.commit(ticket):
-                return Withdrawn(TAKEN_BACK)
+                return Withdrawn(ticket.withdrawn or TAKEN_BACK)
             if decision.request.operation == "put":
                 self._approvals.withdraw_replaced(decision.request)
             if decision.outcome == "waiting":
@@ -503,7 +503,7 @@ class Worker:
             self._agenda.failed("own work")
 
     def _check_proposals(self) -> None:
-        if self._due_in()["check"] > 0:
+        if self._due_in(has_news=self._approvals.has_news)["check"] > 0:
             return
         try:
             self._agenda.check_begins()

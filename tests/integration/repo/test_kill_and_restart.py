@@ -333,7 +333,9 @@ def test_a_goal_that_this_version_cannot_read_is_refused_and_stops_no_start(
     ]
     rig.leave_in_journal(settings.data_home(url), *left)
     assert rig.restart(url)
-    assert re.search(r"demand op-0 .* from the journal: refused: .* colour: is not a field", caplog.text)
+    assert re.search(
+        r"demand op-0 .* from the journal: refused: .* colour: is not a field", caplog.text
+    )
     assert rig.operations(bare) == ["op-1"]
 
 

@@ -141,9 +141,7 @@ class RepoSettings(FileModel):
 
     The file may contain both ``flux`` and ``argocd``. Only the section that ``gitops`` names is
     used. ``placement`` is the rule by which the generator chooses among the nodes that fit an
-    application (:mod:`.placement`). ``signed_off_by`` is for Git servers that want a line
-    ``Signed-off-by`` in each commit: the generator's commits get this one, and the commits that
-    people make with ``demandops`` their own.
+    application (:mod:`.placement`).
     """
 
     kind: Literal["StateRepository"]
