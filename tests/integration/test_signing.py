@@ -389,7 +389,7 @@ def test_commits_are_signed_off_if_the_settings_name_who_does(on: On, state: Git
     settings = state.files()["demandops.yaml"]
     state.commit({"demandops.yaml": f"{settings}signedOffBy: {platform}\n"})
     on.book(goal([], [connection("c")]))
-    assert on("suspend", "c", "-m", "Repair", "--yes").code == 0
+    assert on("suspend", "--connection", "c", "-m", "Repair", "--yes").code == 0
     form = "--format=%an|%(trailers:key=Signed-off-by,valueonly,separator=%x2C)"
     by_person, by_generator = git(state.path, "log", "-2", form).splitlines()
     name, _, signed = by_person.partition("|")
