@@ -168,7 +168,7 @@ def read_reference_parameters(ros_args: Sequence[str]) -> dict[str, Any]:
     values = read_overrides("application_manager", args)
     for name, value in values.items():
         if name in (ACTION_NAME, "namespace", "k3d_image_registry") or _BROKER.fullmatch(name):
-            read = ros_name if name == ACTION_NAME else text
+            read = ros_name_or_none if name == ACTION_NAME else text
             values[name] = Parameter("", "", read=read).value(name, value)
     topics = values.get(_TOPICS) or []
     if not isinstance(topics, list) or not all(isinstance(topic, str) for topic in topics):
