@@ -168,33 +168,23 @@ def show_slow(text: str) -> None:  # an empty text clears the line
 
 
 @contextmanager
-def busy(title: str) -> Iterator[Callable[[str], None]]:
-    # on a terminal, the title and the elapsed seconds, if the block takes a second or longer; the
-    # function that it yields replaces the title
-
-    def say(text: str) -> None:
-        nonlocal title
-        title = text
-
-    if not sys.stderr.isatty():
-        yield say
-        return
-    ended, shown = REAL.event(), REAL.event()
+def busy(title: str) -> Iterator[None]:
+    # on a terminal, the title and the elapsed seconds, if the block takes a second or longer
+    ended = REAL.event()
 
     def tick() -> None:
         seconds = 0
         while not ended.wait(1):
             seconds += 1
-            shown.set()
             show_slow(f"{title}, {seconds} s")
 
-    thread = REAL.start_thread("busy", tick)
+    thread = REAL.start_thread("busy", tick) if sys.stderr.isatty() else None
     try:
-        yield say
+        yield
     finally:
         ended.set()
-        thread.join()
-        if shown.is_set():
+        if thread is not None:
+            thread.join()
             show_slow("")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from demandops.base.runtime import REAL
 from demandops.cli import target
 from demandops.cli.authoring import schema
 from demandops.cli.json_output import Json, output_option, show
-from demandops.cli.output import Progress, busy, done, errors, progress
+from demandops.cli.output import busy, done, errors, progress
 from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
@@ -190,14 +189,14 @@ def upgrade(
     now = REAL.now()
     signer = Signer(signing_key) if signing_key and not dry_run else None
     if dry_run or asks:
-        with _shown() as report:
+        with progress("reading the ledger") as report:
             result = upgrading.plan(state_repo, request, now, report)
     if asks and not dry_run and result.switches:
         show(output, None, [_SWITCH])
         if not click.confirm("Are those before it done?"):
             raise click.ClickException("nothing was changed; do these steps first, or give --yes")
     if not dry_run:
-        with _shown() as report:
+        with progress("reading the ledger") as report:
             result = upgrading.upgrade(state_repo, request, now, report, signer)
             done.extend([f"upgraded in {result.commit}"] if result.files else [])
     old, new = result.old.repo_settings, result.new.repo_settings
@@ -212,17 +211,6 @@ def upgrade(
         "after": _steps_after(result),
     }
     show(output, data, _upgrade_lines(result, dry_run))
-
-
-@contextmanager
-def _shown() -> Iterator[Progress]:
-    with busy("reading the state repo") as say:
-
-        def report(done: int, total: int) -> None:
-            read = f"reading the ledger, {done} of {total} files"
-            say(read if done < total else "rendering everything")
-
-        yield report
 
 
 def _steps_after(result: Upgrade) -> list[Json]:
