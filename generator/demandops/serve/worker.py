@@ -535,9 +535,8 @@ class Worker:
             self._repository.refresh()
             # at random, so that generators which all saw the change do not collide again
             self._ends_soon.wait(self._runtime.uniform(0, 0.05))
-        self._agenda.failed(
-            "own work"
-        )  # other generators are faster, and they carry out the same changes
+        # other generators are faster, and they carry out the same changes
+        self._agenda.failed("own work")
         return False
 
     def _new_commit_batch(self) -> CommitBatch:
