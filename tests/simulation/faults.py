@@ -222,7 +222,7 @@ def begin_the_wait_anew(
 plant("forget_those_that_wait", 6, Agenda, "may_have_room", nothing)
 plant("let_others_overtake_in_a_batch", 34, Agenda, "book_those_let_in", nothing)
 plant("leave_drained_nodes_full", 8, agenda, "_to_drain", lambda *_: [])
-plant("place_on_drained_nodes", 1, Choice, "_closed", lambda *_: "")
+plant("place_on_drained_nodes", 12, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 5, placement, "_booked", nothing)
 plant("count_no_room", 2, capacity, "excesses", lambda *_: [])
 

@@ -183,6 +183,7 @@ PATTERN_WORDS = {
     r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$": "the tag of an image, such as v1.2.0",
     r"^[A-Z][A-Za-z0-9]*$": "a kind of Kubernetes object, such as ConfigMap",
     r"^([a-z0-9]([a-z0-9.-]*[a-z0-9])?)?$": "the group of an API, such as batch, or nothing",
+    r"^[^<>\s][^<>\n]* <[^<>\s]+@[^<>\s]+>$": "a name and an address, like Ann <ann@example.org>",
     r"^https?://\S+$": "a URL that begins with https:// or http://",
     r"^https?://[^\s]+$": "a URL that begins with https:// or http://",
     r"^oci://[^\s]+$": "a URL that begins with oci://",

@@ -154,8 +154,5 @@ class RepoSettings(FileModel):
     limits: Limits = Limits()
     placement: Literal["nearest", "spread", "pack"] = "nearest"
     signed_off_by: (
-        Annotated[
-            str, StringConstraints(pattern=r"^[^<>\s]([^<>\n\r]*[^<>\s])? <[^<>\s]+@[^<>\s]+>$")
-        ]
-        | None
+        Annotated[str, StringConstraints(pattern=r"^[^<>\s][^<>\n]* <[^<>\s]+@[^<>\s]+>$")] | None
     ) = None

@@ -142,7 +142,7 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 def signed_off(text: str, by: str) -> str:
     # in the last paragraph if it has trailers, as `git commit --signoff`
     gap = "" if parse(text).trailers else "\n"
-    return f"{text.rstrip()}\n{gap}Signed-off-by: {by}\n"
+    return f"{text.rstrip()}\n{gap}Signed-off-by: {one_line(by)}\n"
 
 
 def of_decision(
