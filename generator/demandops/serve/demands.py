@@ -22,7 +22,6 @@ import logging
 from collections import Counter, OrderedDict, deque
 from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from demandops.base import errors
 from demandops.base.errors import (
@@ -171,6 +170,7 @@ class Demands:
         # Why no demand can be published now, or empty. QueueFull quotes it: a queue that is full
         # behind a remote that is away needs another remedy than a client that sends too much.
         self.blocked = ""
+        self._give_up_what_is_dropped()  # before the worker begins
 
     # ---- queries ----
 
@@ -259,8 +259,7 @@ class Demands:
             self._arrival.wait(_LOOK_S)
             self._arrival.clear()
             self._take_in()
-            for request in self._journal.drop_requests():
-                self._give_up(request)
+            self._give_up_what_is_dropped()
 
     def _take_in(self) -> None:
         if not self._arrived:
@@ -367,18 +366,19 @@ class Demands:
                 return False
         return True
 
-    def _give_up(self, request: Path) -> None:
-        with self._changed:
-            ticket = self._tickets.get(request.name.partition("-")[2])
-            if ticket is None:  # it is answered
-                request.unlink()
-            elif ticket.state != "withdrawn":
-                log.warning("%s: demand %s", GIVEN_UP, ticket.operation)
-                # a push of a committed demand may have arrived, so the next attempt answers it
-                if ticket.state == "committed":
-                    ticket.state, ticket.withdrawn = "withdrawn", GIVEN_UP
-                else:
-                    self._withdraw(ticket, GIVEN_UP)
+    def _give_up_what_is_dropped(self) -> None:
+        for request in self._journal.drop_requests():
+            with self._changed:
+                ticket = self._tickets.get(request.name.partition("-")[2])
+                if ticket is None:  # it is answered
+                    request.unlink()
+                elif ticket.state != "withdrawn":
+                    log.warning("%s: demand %s", GIVEN_UP, ticket.operation)
+                    # a push of a committed demand may have arrived, so the next attempt answers it
+                    if ticket.state == "committed":
+                        ticket.state, ticket.withdrawn = "withdrawn", GIVEN_UP
+                    else:
+                        self._withdraw(ticket, GIVEN_UP)
 
     def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
         with self._changed:

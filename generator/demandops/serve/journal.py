@@ -407,6 +407,8 @@ def open_journal(folder: Path) -> Journal:
         if held is not None:
             with held:
                 journal.append(read(other).values())
+                for request in other.parent.glob(f"{_DROP}*"):
+                    request.replace(folder / request.name)
                 other.unlink()
     return journal
 

@@ -340,11 +340,17 @@ def test_a_goal_that_this_version_cannot_read_is_refused_and_stops_no_start(
 
 
 def test_a_demand_that_is_dropped_is_not_carried_out_at_the_next_start(
-    url: str, bare: Path, demandops: Run
+    url: str, bare: Path, data_home: Path, demandops: Run, caplog: pytest.LogCaptureFixture
 ) -> None:
     _leave_pending(url, bare, [1, 2])
     command = ("journal", "--state-repo", url, "--drop")
     assert demandops(*command, "op-1").out.startswith("demand op-1 is given up; ")
+    _leave_pending(url, bare, [3])
+    journal = next(data_home.glob("*/slot-0/outbox.jsonl"))
+    slot = journal.parent.with_name("slot-7")  # of a process that died before it gave op-3 up
+    slot.mkdir()
+    journal.rename(slot / journal.name)
+    (slot / "drop-op-3").touch()
     assert demandops(*command, "op-1").err == (
         "error: no journal on this machine has a demand with the operation id 'op-1'; "
         "`demandops journal` lists those that it has\n"
