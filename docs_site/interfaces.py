@@ -31,15 +31,8 @@ def page() -> str:
 
 def _parameters() -> str:
     rows = ["| parameter | default | meaning |", "| --- | --- | --- |"]
-    for name, default in node_parameters.DEFAULTS.items():
-        told = node_parameters.descriptor(name)
-        ranges = [
-            f"{one.from_value:g} to {one.to_value:g}"
-            for one in (*told.floating_point_range, *told.integer_range)
-        ]
-        limits = "; ".join([*filter(None, [told.additional_constraints]), *ranges])
-        shown = f"`{default}`" if default != "" else ""
-        rows.append(
-            f"| `{name}` | {shown} | {told.description}{f' ({limits})' if limits else ''} |"
-        )
+    for name, parameter in node_parameters.PARAMETERS.items():
+        shown = f"`{parameter.default}`" if parameter.default != "" else ""
+        limits = f" ({parameter.limits})" if parameter.limits else ""
+        rows.append(f"| `{name}` | {shown} | {parameter.description}{limits} |")
     return "\n".join(rows)

@@ -16,7 +16,7 @@ from demandops.base.errors import DemandOpsError, InvalidInput, Withdrawn
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.cluster.health import Level
-from demandops.serve.demands import Receipt
+from demandops.serve.journal import Receipt
 from demandops_interfaces.action import Demand
 from rclpy.action import ActionClient, ActionServer
 from rclpy.action.client import ClientGoalHandle

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-import signal
 from typing import Any
 
 import click
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput, fault
-from demandops.base.runtime import REAL
+from demandops.base.quoting import one_line
 from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops.base.strict_yaml import read_input
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import errors
+from demandops.cli.output import done, errors, read_by
 from demandops.model.config.base_model import duration_text
 
 from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
+from demandops_ros.node_parameters import ros_name
+from demandops_ros.ros_process import StopSignals
 
 
 @click.command()
@@ -28,6 +29,7 @@ from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
     default=DEFAULT_DEMAND_ACTION_NAME,
     show_default=True,
     metavar="NAME",
+    callback=read_by(ros_name),
     help="The name of the node's action Demand.",
 )
 @click.option(
@@ -67,7 +69,11 @@ def demand(
         names = ("demand", "requesters", "request")
         data = {field: value for field, value in data.items() if field in names}
         data["operation"] = "release" if release else "renew"
-    with DemandClient(action_name=action, timeout_s=timeout) as client:
+    try:
+        opened = DemandClient(action_name=action, timeout_s=timeout)
+    except Exception as error:  # rclpy raises errors of many kinds
+        raise click.ClickException(f"ROS does not start: {one_line(str(error))}") from error
+    with opened as client:
         try:
             if hold:
                 _hold(client, data, output)
@@ -97,26 +103,21 @@ def _print_answer(answer: Answer, output: str) -> None:
     }
     lease = f", for {duration_text(answer.lease_s)} unless renewed" if answer.lease_s else ""
     commit = f" in {answer.commit}" if answer.commit else ""
+    done.append(f"{answer.outcome}{commit}")
     show(output, data, [f"{answer.outcome}{commit}{lease}"])
     for warning in answer.warnings if output == "text" else ():
         errors.print(f"warning: {warning}")
 
 
 def _hold(client: DemandClient, data: dict[str, Any], output: str) -> None:
-    over = REAL.event()
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
     client.requesters = tuple(data.get("requesters", ()))
     goal, on_stage = {**data, "operation": "put"}, _print_stages(output)
-    with HeldDemand(
-        client, str(data.get("demand", "")), lambda: client.send(goal, on_stage)
-    ) as held:
+    held = HeldDemand(client, str(data.get("demand", "")), lambda: client.send(goal, on_stage))
+    with StopSignals() as signals, held:
         if held.answer is not None:
             _print_answer(held.answer, output)
         if output != "json":
             errors.print("held until Ctrl-C")
-        over.wait()
-    for number, handler in before.items():
-        signal.signal(number, handler)
+        signals.wait()
     if output != "json":
         errors.print("released")

@@ -11,14 +11,15 @@ from datetime import datetime
 from functools import partial
 from typing import Any, TypeGuard
 
+import click
 from demandops.base.errors import DemandOpsError, InvalidInput, NotReached, Unsound, Withdrawn
 from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
 from demandops.cluster.health import Health, Level
 from demandops.cluster.rollouts import RolloutWatcher
 from demandops.repo.load.snapshot import Snapshot
-from demandops.serve.demands import Receipt, Ticket
 from demandops.serve.generator import Generator
+from demandops.serve.journal import Receipt, Ticket
 from demandops.views.bookkeeping import as_data, bookkeeping
 from demandops_interfaces.msg import Bookkeeping as BookkeepingMessage
 from demandops_interfaces.srv import GetBookkeeping
@@ -181,20 +182,23 @@ class DemandNode(Node):  # type: ignore[misc]
         self.create_timer(1.0, self._report)
 
     def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> LastingResults:
-        return LastingResults(
-            self,
-            adapter.action,
-            name,
-            execute_callback=self._execute,
-            goal_callback=partial(self._accept_or_reject, adapter),
-            handle_accepted_callback=self._accepted,
-            cancel_callback=self._cancel,
-            callback_group=ReentrantCallbackGroup(),  # goals arrive while others are journaled
-            goal_service_qos_profile=actions.DEEP_QOS,
-            result_service_qos_profile=actions.DEEP_QOS,
-            cancel_service_qos_profile=actions.DEEP_QOS,
-            feedback_pub_qos_profile=actions.DEEP_QOS,
-        )
+        try:
+            return LastingResults(
+                self,
+                adapter.action,
+                name,
+                execute_callback=self._execute,
+                goal_callback=partial(self._accept_or_reject, adapter),
+                handle_accepted_callback=self._accepted,
+                cancel_callback=self._cancel,
+                callback_group=ReentrantCallbackGroup(),  # goals arrive while others are journaled
+                goal_service_qos_profile=actions.DEEP_QOS,
+                result_service_qos_profile=actions.DEEP_QOS,
+                cancel_service_qos_profile=actions.DEEP_QOS,
+                feedback_pub_qos_profile=actions.DEEP_QOS,
+            )
+        except ValueError as error:  # such as remapping rules that give both actions one name
+            raise click.UsageError(f"ROS does not take {name}: {one_line(str(error))}") from None
 
     def close(self) -> None:
         self._is_closed.set()

@@ -7,13 +7,11 @@ from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
-from builtin_interfaces.msg import Duration
 from demandops.base.errors import suggestion
 from demandops.base.settings import API_VERSION
 from demandops.cluster.health import Level
 from demandops.connections.connection import ROUTE_OPTIONS
 from demandops.model.config.base_model import seconds_of
-from demandops_interfaces import msg as messages
 from demandops_interfaces.action import Demand as DemandMessage
 
 
@@ -81,19 +79,31 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     # message cannot carry raises TypeError, AssertionError, AttributeError or OverflowError.
     more = {"apiVersion", "kind", "lease", "operation", "answer"}
     more |= {"applications", "connections", "positions"}
-    goal = _message(DemandMessage.Goal, **_fields(data, _DEMAND, more, "a demand"))
-    goal.operation = _number(_OPERATIONS, data.get("operation", "put"), "operation")
-    goal.answer = _number(ANSWER_LEVELS, data.get("answer", "pushed"), "answer")
     lease = data.get("lease") or 0
     seconds = seconds_of(lease) if isinstance(lease, str) else lease
-    goal.lease = _message(Duration, sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
-    goal.applications = [_application_message(app) for app in data.get("applications", ())]
-    goal.connections = [_connection_message(item) for item in data.get("connections", ())]
-    goal.positions = [
-        _message(messages.Position, **_fields(position, _POSITION, set(), "a position"))
-        for position in data.get("positions", ())
-    ]
-    return goal
+    fields = {
+        **_fields(data, _DEMAND, more, "a demand"),
+        "operation": _number(_OPERATIONS, data.get("operation", "put"), "operation"),
+        "answer": _number(ANSWER_LEVELS, data.get("answer", "pushed"), "answer"),
+        "lease": {"sec": int(seconds), "nanosec": int(seconds % 1 * 1e9)},
+        "applications": [_application_fields(app) for app in data.get("applications", ())],
+        "connections": [
+            {
+                **_fields(item, _CONNECTION, {"type", "topics"}, "a connection"),
+                "type": _number(_TYPES[:-1], item.get("type", "auto"), "type"),
+                "topics": [
+                    _fields(route, _ROUTE, set(), "a topic of a connection")
+                    for route in item.get("topics", ())
+                ],
+            }
+            for item in data.get("connections", ())
+        ],
+        "positions": [
+            _fields(position, _POSITION, set(), "a position")
+            for position in data.get("positions", ())
+        ],
+    }
+    return fill_message(DemandMessage.Goal(), fields)
 
 
 def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -116,49 +126,29 @@ def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
     }
 
 
-def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
+def _application_fields(data: Mapping[str, Any]) -> dict[str, Any]:
     others = {"inputs", "parameters", "parameters_json", "connect", "place", "deliver", "services"}
     values = {name: json.dumps(value) for name, value in data.get("parameters", {}).items()}
     values |= data.get("parameters_json", {})
     connect = data.get("connect", "auto")
-    if isinstance(connect, str):
-        connect = {"type": connect}
-    return _message(
-        messages.Application,
+    connect = {"type": connect} if isinstance(connect, str) else connect
+    return {
         **_fields(data, _APPLICATION, others, "an application"),
         **_fields(data.get("place", {}), _PLACE, set(), "a place"),
-        services=[f"{name}={node}" for name, node in data.get("services", {}).items()],
-        deliver=[
-            _message(messages.Delivery, **_fields(delivery, _DELIVERY, set(), "a delivery"))
+        **_fields(connect, {"broker": "connect_broker"}, {"type"}, "connect"),
+        "services": [f"{name}={node}" for name, node in data.get("services", {}).items()],
+        "deliver": [
+            _fields(delivery, _DELIVERY, set(), "a delivery")
             for delivery in data.get("deliver", ())
         ],
-        inputs=[
-            _message(messages.Input, role=role, **_fields(topic, _INPUT, set(), "an input"))
+        "inputs": [
+            {"role": role, **_fields(topic, _INPUT, set(), "an input")}
             for role, topics in data.get("inputs", {}).items()
             for topic in topics
         ],
-        parameters=[
-            _message(messages.Parameter, name=name, value_json=text)
-            for name, text in values.items()
-        ],
-        connect=_number(_TYPES, connect.get("type", "auto"), "connect"),
-        **_fields(connect, {"broker": "connect_broker"}, {"type"}, "connect"),
-    )
-
-
-def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    topics = []
-    for route in data.get("topics", ()):
-        fields = _fields(route, _ROUTE, set(), "a topic of a connection")
-        if "rate" in fields:  # a message refuses the integer that people write
-            fields["rate"] = float(fields["rate"])
-        topics.append(_message(messages.Route, **fields))
-    return _message(
-        messages.Connection,
-        **_fields(data, _CONNECTION, {"type", "topics"}, "a connection"),
-        type=_number(_TYPES[:-1], data.get("type", "auto"), "type"),
-        topics=topics,
-    )
+        "parameters": [{"name": name, "value_json": text} for name, text in values.items()],
+        "connect": _number(_TYPES, connect.get("type", "auto"), "connect"),
+    }
 
 
 def _data(message: Any, names: Mapping[str, str]) -> dict[str, Any]:  # noqa: ANN401
@@ -175,21 +165,6 @@ def _fields(
     return {field: data[name] for name, field in names.items() if name in data}
 
 
-def _message(kind: Any, **values: Any) -> Any:  # noqa: ANN401 - a generated class
-    message = _checking(kind())
-    for name, value in values.items():
-        setattr(message, name, value)
-    return message
-
-
-def _checking(message: Any) -> Any:  # noqa: ANN401
-    # Messages may not check the values that are assigned to them. A value of a wrong type would
-    # then end the process when the message is sent.
-    if hasattr(message, "_check_fields"):
-        message._check_fields = True
-    return message
-
-
 def _number(words: tuple[str, ...], word: str, field: str) -> int:
     if word not in words:
         raise ValueError(f"{field}: '{word}' is not one of {', '.join(words)}")
@@ -204,7 +179,10 @@ def _word(words: tuple[str, ...], number: int) -> str:
 def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
     # Missing fields keep ROS's defaults. A field or value that the message cannot carry raises
     # AttributeError, AssertionError or TypeError.
-    _checking(message)
+    if hasattr(message, "_check_fields"):
+        # Else a message may not check the values that are assigned to it, and one of a wrong type
+        # would end the process when the message is sent.
+        message._check_fields = True
     types = message.get_fields_and_field_types()
     for name, value in data.items():
         if name not in types:
@@ -217,5 +195,7 @@ def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
             package, class_name = item_type.split("/")
             new = getattr(import_module(f"{package}.msg"), class_name)
             converted = [fill_message(new(), item) for item in value]
+        elif types[name] == "double" and type(value) is int:  # as people write it
+            converted = float(value)
         setattr(message, name, converted)
     return message

@@ -1,14 +1,15 @@
-"""The parameters of the node: its own, and those of the reference's node that it understands."""
+"""The parameters of our nodes, and those of the reference's node that ours understands."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import click
 from demandops.base import settings
-from demandops.base.quoting import quoted
+from demandops.base.quoting import one_line, quoted
 from demandops.model.config.config import (
     BROKERS_FILE,
     DOMAINS_FILE,
@@ -17,11 +18,121 @@ from demandops.model.config.config import (
     Config,
 )
 from demandops.serve.agenda import DEFAULT_INTERVAL, parse_interval
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.exceptions import ParameterException
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.node import Node
+from rclpy.validate_full_topic_name import validate_full_topic_name
 
 from demandops_ros.messages import ANSWER_LEVELS
+
+# ---- the parameters of a node: what each is, and how it is read ----
+#
+# ROS takes the type of a parameter from its text, so 2024 is a number even where a name is due. We
+# read the values as ROS has them, and declare them afterwards.
+
+
+def text(value: object) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int) and not isinstance(value, bool):
+        return str(value)
+    raise ValueError("takes text; put it in quotes")
+
+
+def ros_name(value: object) -> str:
+    name = text(value)
+    try:
+        validate_full_topic_name(expand_topic_name(name, "demandops", "/"))
+    except Exception as error:  # rclpy raises errors of many kinds
+        reason = one_line(str(error)).partition(", at /")[0]
+        raise ValueError(f"takes a ROS name, such as /fleet/demand ({reason})") from None
+    return name
+
+
+def ros_name_or_none(value: object) -> str:
+    return ros_name(value) if value else ""
+
+
+def duration(value: object) -> str:
+    written = f"{value:g}" if isinstance(value, float) else text(value)
+    try:
+        parse_interval(written)
+    except ValueError:
+        raise ValueError("takes a duration like 90s, 10m or 1h30m, or seconds") from None
+    return written
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    default: Any
+    description: str
+    span: tuple[float, float] | None = None  # of a number, whose type is that of the default
+    choices: Sequence[str] = ()
+    read: Callable[[object], str] = text  # if it is no number; raises ValueError
+
+    def value(self, name: str, given: object) -> Any:  # noqa: ANN401 - of the default's type
+        try:
+            kind = type(self.default)
+            if self.span is None:
+                if (value := self.read(given)) not in (self.choices or [value]):
+                    raise ValueError(f"takes {', '.join(self.choices)}")
+                return value
+            if isinstance(given, bool) or not isinstance(given, (int, kind)):
+                raise ValueError("takes a whole number" if kind is int else "takes a number")
+            if not self.span[0] <= given <= self.span[1]:
+                raise ValueError(f"takes a number from {self.limits}")
+            return kind(given)
+        except ValueError as error:
+            shown = one_line(str(given))
+            raise click.UsageError(f"parameter {name} is {shown!r}; it {error}") from None
+
+    @property
+    def limits(self) -> str:
+        if self.span is not None:
+            return f"{self.span[0]:g} to {self.span[1]:g}"
+        return f"one of {', '.join(self.choices)}" if self.choices else ""
+
+
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
+LOG_LEVEL = Parameter("info", "Lowest level of messages in the log.", choices=LOG_LEVELS)
+
+
+def read_overrides(node_name: str, args: Sequence[str] | None = None) -> dict[str, Any]:
+    # as the ROS arguments of the process, or only ``args``, set them; by a temporary node
+    probe = Node(
+        node_name,
+        cli_args=args,
+        use_global_arguments=args is None,
+        start_parameter_services=False,
+        enable_rosout=False,
+        automatically_declare_parameters_from_overrides=True,
+    )
+    try:
+        parameters = probe.get_parameters_by_prefix("")
+        return {name: parameter.value for name, parameter in parameters.items()}
+    finally:
+        probe.destroy_node()
+
+
+def read_parameters(
+    node_name: str, parameters: Mapping[str, Parameter], given: Mapping[str, object]
+) -> dict[str, Any]:
+    """Return all values; ``given`` replaces defaults, and the ROS arguments replace both."""
+    named = {name: value for name, value in given.items() if value} | read_overrides(node_name)
+    return {
+        name: each.value(name, named.get(name, each.default)) for name, each in parameters.items()
+    }
+
+
+def declare(node: Node, parameters: Mapping[str, Parameter], values: Mapping[str, Any]) -> None:
+    for name, each in parameters.items():
+        described = ParameterDescriptor(
+            description=each.description,
+            additional_constraints=each.limits,
+            read_only=True,  # because a later change would have no effect
+        )
+        node.declare_parameter(name, values[name], described, ignore_override=True)
+
 
 # ---- the parameters of the reference's node, and warnings about those without effect ----
 #
@@ -33,6 +144,8 @@ from demandops_ros.messages import ANSWER_LEVELS
 ACTION_NAME = "deployment_action_name"
 _RENAMES = re.compile(r".*__(node|name):=.*")
 _BROKER = re.compile(r"connections\.communication_broker(_params\.(?P<node>.+))?\.host")
+
+_TOPICS = "connections.init_comm_topics"
 
 _REPLACED = {
     "cluster_config": "a GitOps controller applies what is committed; if the node shall not "
@@ -52,19 +165,15 @@ def read_reference_parameters(ros_args: Sequence[str]) -> dict[str, Any]:
         if _RENAMES.fullmatch(word) and ros_args[at - 1] in ("-r", "--remap")
     }
     args = [word for at, word in enumerate(ros_args) if not {at, at + 1} & renames]
-    probe = Node(
-        "application_manager",
-        cli_args=args,
-        use_global_arguments=False,
-        start_parameter_services=False,
-        enable_rosout=False,
-        automatically_declare_parameters_from_overrides=True,
-    )
-    try:
-        parameters = probe.get_parameters_by_prefix("")
-        return {name: parameter.value for name, parameter in parameters.items()}
-    finally:
-        probe.destroy_node()
+    values = read_overrides("application_manager", args)
+    for name, value in values.items():
+        if name in (ACTION_NAME, "namespace", "k3d_image_registry") or _BROKER.fullmatch(name):
+            read = ros_name_or_none if name == ACTION_NAME else text
+            values[name] = Parameter("", "", read=read).value(name, value)
+    topics = values.get(_TOPICS) or []
+    if not isinstance(topics, list) or not all(isinstance(topic, str) for topic in topics):
+        raise click.UsageError(f"parameter {_TOPICS} is {topics!r}; it takes a list of texts")
+    return values
 
 
 def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
@@ -103,7 +212,7 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
                 f"parameter {name} of the reference is not used: the broker {place}at "
                 f"{address} is not in {config.place_of(BROKERS_FILE)}; add it there"
             )
-    topics = values.get("connections.init_comm_topics") or ()
+    topics = values.get(_TOPICS) or ()
     bridged = {
         topic for node in config.nodes.values() for to in node.bridged.values() for topic in to
     }
@@ -115,87 +224,58 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
         )
 
 
-# ---- the node's parameters: their defaults, descriptions and ranges ----
+# ---- the parameters of the node that takes demands ----
 
-LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
-_CHOICES = {
-    "answer": ANSWER_LEVELS,
-    "deployment_request_ids": ("use", "ignore"),
-    "log_level": LOG_LEVELS,
-}
-DEFAULTS: dict[str, Any] = {
-    "action_name": settings.DEFAULT_ACTION_NAME,
-    "demand_action_name": settings.DEFAULT_DEMAND_ACTION_NAME,
-    "answer": ANSWER_LEVELS[0],
-    "answer_timeout": 120.0,
-    "deployment_request_ids": "use",
-    "state_repo": "",
-    "fetch_interval": DEFAULT_INTERVAL,
-    "requester_queue_limit": settings.REQUESTER_QUEUE_LIMIT,
-    "log_level": "info",
-}
-_DESCRIPTIONS = {
-    "action_name": "Name of the action DeploymentRequest, which the reference's clients use.",
-    "demand_action_name": "Name of the action Demand.",
-    "answer": "When a DeploymentRequest is answered.",
-    "answer_timeout": "How many seconds a goal may take to be reconciled or healthy.",
-    "deployment_request_ids": "Whether the id of a DeploymentRequest tells apart what is demanded; "
-    "ignored, all are booked under one id.",
-    "state_repo": "Folder or URL of the state repo.",
-    "fetch_interval": "How often people's commits are fetched while no demand comes; 0 means no "
-    "fetches at an interval.",
-    "requester_queue_limit": "How many demands of one requester may be without an answer; more "
-    "are rejected.",
-    "log_level": "Lowest level of messages in the log.",
+PARAMETERS = {
+    "action_name": Parameter(
+        settings.DEFAULT_ACTION_NAME,
+        "Name of the action DeploymentRequest, which the reference's clients use.",
+        read=ros_name,
+    ),
+    "demand_action_name": Parameter(
+        settings.DEFAULT_DEMAND_ACTION_NAME, "Name of the action Demand.", read=ros_name
+    ),
+    "answer": Parameter(
+        ANSWER_LEVELS[0], "When a DeploymentRequest is answered.", choices=ANSWER_LEVELS
+    ),
+    "answer_timeout": Parameter(
+        120.0,
+        "How many seconds a goal may take to be reconciled or healthy.",
+        span=(0.001, 86_400.0),
+    ),
+    "deployment_request_ids": Parameter(
+        "use",
+        "Whether the id of a DeploymentRequest tells apart what is demanded; ignored, all are "
+        "booked under one id.",
+        choices=("use", "ignore"),
+    ),
+    "state_repo": Parameter("", "Folder or URL of the state repo."),
+    "fetch_interval": Parameter(
+        DEFAULT_INTERVAL,
+        "How often people's commits are fetched while no demand comes; 0 means no fetches at an "
+        "interval.",
+        read=duration,
+    ),
+    "requester_queue_limit": Parameter(
+        settings.REQUESTER_QUEUE_LIMIT,
+        "How many demands of one requester may be without an answer; more are rejected.",
+        span=(1, settings.QUEUE_LIMIT),
+    ),
+    "log_level": LOG_LEVEL,
 }
 
-_SECONDS = [FloatingPointRange(from_value=0.001, to_value=86_400.0)]
-_COUNT = [IntegerRange(from_value=1, to_value=settings.QUEUE_LIMIT, step=1)]
-_RANGES: dict[str, Any] = {
-    "answer_timeout": {"floating_point_range": _SECONDS},
-    "requester_queue_limit": {"integer_range": _COUNT},
-}
 
-
-def read_node_parameters(given: Mapping[str, str | None]) -> dict[str, Any]:
-    """Return all values; ``given`` replaces defaults, and the ROS arguments replace both."""
-    # a temporary node reads them, because the generator starts before the node
-    defaults = DEFAULTS | {name: value for name, value in given.items() if value}
-    probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
-    try:
-        values = {
-            name: probe.declare_parameter(name, default, descriptor(name)).value
-            for name, default in defaults.items()
-        }
-    except ParameterException as error:
-        raise click.UsageError(str(error)) from None
-    finally:
-        probe.destroy_node()
-    interval = values["fetch_interval"]  # ROS reads 30 as a number and 30s as text
-    values["fetch_interval"] = f"{interval:g}" if isinstance(interval, float) else str(interval)
+def read_node_parameters(given: Mapping[str, object]) -> dict[str, Any]:
+    values = read_parameters("demandops", PARAMETERS, given)
     if not values["state_repo"]:
         raise click.UsageError(
             "no state repo given; use --state-repo URL_OR_DIR, DEMANDOPS_STATE_REPO or the ROS "
             "parameter state_repo"
         )
-    try:
-        parse_interval(values["fetch_interval"])
-    except ValueError as error:
-        raise click.UsageError(f"fetch interval: {error}") from None
-    for name, choices in _CHOICES.items():
-        if values[name] not in choices:
-            raise click.UsageError(
-                f"parameter {name} is '{values[name]}'; it takes {', '.join(choices)}"
-            )
+    names = ("action_name", "demand_action_name")
+    if len({expand_topic_name(values[name], "demandops", "/") for name in names}) == 1:
+        raise click.UsageError(
+            f"the parameters {' and '.join(names)} are both {values['action_name']}; give each "
+            "action a name of its own"
+        )
     return values
-
-
-def descriptor(name: str, *, read_only: bool = False) -> ParameterDescriptor:
-    choices = _CHOICES.get(name)
-    return ParameterDescriptor(
-        description=_DESCRIPTIONS[name],
-        additional_constraints=f"one of {', '.join(choices)}" if choices else "",
-        read_only=read_only,
-        dynamic_typing=name == "fetch_interval",
-        **_RANGES.get(name, {}),
-    )

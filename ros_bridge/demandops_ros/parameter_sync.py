@@ -17,7 +17,8 @@ from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from demandops_ros import ros_process
+from demandops_ros import node_parameters, ros_process
+from demandops_ros.node_parameters import read_parameters, ros_name_or_none
 
 # ---- the text of a ROS parameter file ----
 
@@ -135,13 +136,15 @@ class ParameterSetter:
 
 # ---- the command ----
 
-# The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher,
-# without its `period`, because a watch does not poll.
+# The names are those of the reference's k8s_configmap_watcher, without its `period`, because a
+# watch does not poll.
 _PARAMETERS = {
-    "configmap_name": "",
-    "namespace": "",
-    "ros_params_file_name": "params.yml",
-    "target_ros_node": "",
+    "configmap_name": node_parameters.Parameter("", "Name of the ConfigMap."),
+    "namespace": node_parameters.Parameter("", "Namespace of the ConfigMap."),
+    "ros_params_file_name": node_parameters.Parameter("params.yml", "The key in the ConfigMap."),
+    "target_ros_node": node_parameters.Parameter(
+        "", "The node whose parameters are set.", read=ros_name_or_none
+    ),
 }
 
 
@@ -168,13 +171,11 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
     Examples:
       demandops parameter-sync --ros-args --params-file fusion.yaml
     """
-    with ros_process.stop_signals() as wait_for_signal, ros_process.started(ctx.args):
+    with ros_process.StopSignals() as signals, ros_process.started(ctx.args):
+        given = read_parameters("parameter_sync", _PARAMETERS, {})
         node = Node("parameter_sync")
+        node_parameters.declare(node, _PARAMETERS, given)
         ros_process.log_to(get_logger("demandops"), "info")
-        given: dict[str, str] = {
-            name: node.declare_parameter(name, default).value
-            for name, default in _PARAMETERS.items()
-        }
         for name, value in given.items():
             if not value:
                 raise click.UsageError(
@@ -194,7 +195,7 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
 
         watch = ConfigMapWatch(given["namespace"], given["configmap_name"], take, kubeconfig)
         thread = ros_process.ExecutorThread(node)
-        wait_for_signal()
+        signals.wait()
         # the watch first, because it calls the node
         watch.close()
         thread.close()

@@ -10,11 +10,14 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 
 import click
 import rclpy
 from demandops.base.quoting import OneLineFormatter, one_line
 from demandops.base.runtime import REAL
+from demandops.cli.main import ExitCode
+from demandops.cli.output import errors
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.logging import LoggingSeverity, set_logger_level
@@ -53,24 +56,46 @@ class ExecutorThread:
             self._executor.shutdown(timeout_sec=0)
 
 
-@contextmanager
-def stop_signals() -> Iterator[Callable[[], None]]:
-    # a function that waits for Ctrl-C or SIGTERM; after it, a further one ends the process at once
-    over = REAL.event()
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
+class StopSignals:
+    """Handles Ctrl-C, SIGTERM and SIGHUP: the first ends the program in order, the second at once.
 
-    def wait() -> None:
-        while not over.wait(0.2):  # poll, because another thread may get the signal
-            pass
-        for number in numbers:
-            signal.signal(number, signal.SIG_DFL)
+    A closed terminal sends SIGHUP, unless `nohup` started the program.
+    """
 
-    try:
-        yield wait
-    finally:
-        for number, handler in before.items():
+    def __init__(self) -> None:
+        self.stopping = False
+        self._woken = REAL.event()
+
+    def __enter__(self) -> StopSignals:
+        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        self._before = {
+            number: signal.signal(number, self._handle)
+            for number in numbers
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
+        }
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before.items():
             signal.signal(number, handler)
+
+    def wait(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Wait until a signal comes or ``until()`` is true, which each :meth:`wake` checks."""
+        while not (self.stopping or until() or REAL.unsound):
+            self._woken.wait(0.2)  # poll, because another thread may get the signal
+            self._woken.clear()
+        if REAL.unsound is not None:
+            errors.print(f"error: {REAL.unsound}")
+            os._exit(ExitCode.PROGRAM_ERROR)  # an orderly exit could answer goals
+
+    def wake(self) -> None:
+        self._woken.set()
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if self.stopping:
+            errors.print("stopped at once")
+            os._exit(ExitCode.INTERRUPTED)
+        self.stopping = True
 
 
 class RosLogHandler(logging.Handler):
@@ -99,20 +124,28 @@ def started(arguments: Sequence[str]) -> Iterator[list[str]]:
         raise click.UsageError(
             f"unexpected argument {ros_args[0]}; ROS arguments follow --ros-args"
         )
-    if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
+    home = os.environ.get("ROS_HOME") or os.environ.get("HOME") or ""
+    if not (os.environ.get("ROS_LOG_DIR") or os.access(home, os.W_OK)):
         # ROS's log library does not start in a container without a home folder
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     try:
         no_signals = SignalHandlerOptions.NO
         rclpy.init(args=["demandops", *ros_args], signal_handler_options=no_signals)
     except Exception as error:  # rclpy raises errors of many kinds
+        message = one_line(str(error))
         if not ros_args:
-            raise
+            raise click.ClickException(f"ROS does not start: {message}") from None
         raise click.UsageError(
-            f"ROS does not start with the arguments after --ros-args: {one_line(str(error))}"
+            f"ROS does not start with the arguments after --ros-args: {message}"
         ) from None
     try:
         yield ros_args
+    except Exception as error:
+        if not ros_args or type(error).__module__.partition(".")[0] not in ("rclpy", "_rclpy"):
+            raise
+        raise click.UsageError(
+            f"ROS does not take the arguments after --ros-args: {one_line(str(error))}"
+        ) from error
     finally:
         rclpy.try_shutdown()
 

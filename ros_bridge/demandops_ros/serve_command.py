@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import signal
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import click
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_secret
-from demandops.cli.main import ExitCode
 from demandops.cli.output import errors, progress
 from demandops.cli.target import signing_option
 from demandops.cluster import clusters_file, reconcile_trigger
@@ -133,7 +128,8 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
                 signing_key=signing_key,
             )
         parts.callback(generator.close)
-        signals = parts.enter_context(_Signals())
+        signals = parts.enter_context(ros_process.StopSignals())
+        REAL.when_unsound = signals.wake
         for warning in node_parameters.warnings(of_reference, generator.snapshot.state.config):
             errors.print(f"warning: {warning}")
         trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
@@ -177,7 +173,10 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
 
 
 def _run(
-    generator: Generator, settings: dict[str, Any], status: RolloutWatcher | None, signals: _Signals
+    generator: Generator,
+    settings: dict[str, Any],
+    status: RolloutWatcher | None,
+    signals: ros_process.StopSignals,
 ) -> None:
     node = DemandNode(
         generator,
@@ -188,10 +187,8 @@ def _run(
         status,
         ignores_ids=settings["deployment_request_ids"] == "ignore",
     )
-    for name, value in settings.items():
-        shown = generator.address if name == "state_repo" else value
-        # read-only, because a later change would have no effect
-        node.declare_parameter(name, shown, node_parameters.descriptor(name, read_only=True))
+    shown = settings | {"state_repo": generator.address}
+    node_parameters.declare(node, node_parameters.PARAMETERS, shown)
     ros_process.log_to(node.get_logger(), settings["log_level"])
     # the node runs in another thread, so that the main thread notices a signal at once
     thread = ros_process.ExecutorThread(node)
@@ -218,39 +215,3 @@ def _run(
     thread.close()
     node.close()
     node.destroy_node()
-
-
-class _Signals:
-    """Handles Ctrl-C and SIGTERM: the first ends the program in order, the second at once."""
-
-    def __init__(self) -> None:
-        self.stopping = False
-        self._woken = REAL.event()
-
-    def __enter__(self) -> _Signals:
-        numbers = (signal.SIGINT, signal.SIGTERM)
-        self._before = {number: signal.signal(number, self._handle) for number in numbers}
-        REAL.when_unsound = self.wake
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-
-    def wait(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a signal comes or ``until()`` is true, which each :meth:`wake` checks."""
-        while not (self.stopping or until() or REAL.unsound):
-            self._woken.wait(0.2)  # poll, because another thread may get the signal
-            self._woken.clear()
-        if REAL.unsound is not None:
-            errors.print(f"error: {REAL.unsound}")
-            os._exit(ExitCode.PROGRAM_ERROR)  # an orderly exit could answer goals
-
-    def wake(self) -> None:
-        self._woken.set()
-
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self.stopping:
-            errors.print("stopped at once; unpublished demands are in the journal")
-            os._exit(ExitCode.INTERRUPTED)
-        self.stopping = True

@@ -39,7 +39,7 @@ def test_the_reference_has_all_that_the_code_has(site: Path) -> None:
     text = {path.stem: path.read_text() for path in (site / "generated").glob("*.html")}
     assert all(f'<h2 id="{name}">' in text["commands"] for name in COMMANDS)
     assert all(f'<h2 id="{name}">' in text["schemas"] for name in SCHEMAS)
-    assert all(f"<code>{name}</code>" in text["ros"] for name in node_parameters.DEFAULTS)
+    assert all(f"<code>{name}</code>" in text["ros"] for name in node_parameters.PARAMETERS)
     assert all(site.joinpath("schemas", f"{name}.json").is_file() for name in SCHEMAS)
     messages = MESSAGES.read_text().partition("\n# fields\n")[0]
     assert text["errors"].count("<br") + text["errors"].count("<tr>") - text["errors"].count(

@@ -35,8 +35,7 @@ from demandops.model.ledger import records
 from demandops.repo.forge import ForgeError, Gitea, GitHub
 from demandops.repo.git import local_repository as addresses
 from demandops.repo.history import commit_log, commit_message, revisions
-from demandops.repo.write import journal
-from demandops.serve.demands import ticket_from_journal
+from demandops.serve import journal
 from demandops.serve.http_server import PushWebhook
 from demandops_interfaces.action import Demand
 from demandops_ros import messages
@@ -285,11 +284,10 @@ def end_of_override(data: bytes) -> None:
 
 
 def journal_line(data: bytes) -> None:
-    for record in journal.parse(data, Path("journal")).values():
-        ticket = ticket_from_journal(record)
+    for ticket in journal.parse(data, Path("journal")).values():
         assert ticket.received < NOW.replace(year=9999)
-        again = journal.parse(journal._sealed([record], "")[0], Path())
-        assert again == {ticket.operation: record}
+        (again,) = journal.parse(journal._sealed([ticket.as_data()], "")[0], Path()).values()
+        assert again.as_data() == ticket.as_data()
 
 
 def commit(data: bytes) -> None:

@@ -20,7 +20,7 @@ from tests.kit.limits import PATIENCE_S
 from tests.kit.rig import Person
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_an_interrupted_request_says_which_demands_are_answered(
     bare: Path, data_home: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], number: int
 ) -> None:

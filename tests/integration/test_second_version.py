@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from demandops.base import settings
-from demandops.repo.write.journal import read
+from demandops.serve.journal import read
 
 from tests.integration.conftest import On
 from tests.kit import plain_yaml

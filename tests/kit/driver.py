@@ -28,11 +28,10 @@ from demandops.model.demand.goals import read_journaled
 from demandops.repo.git.local_repository import LocalRepository
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.write.commit_batch import CommitBatch
-from demandops.repo.write.journal import Journal
 from demandops.repo.write.proposal_branch import ProposalBranches
 from demandops.serve import worker
-from demandops.serve.demands import Receipt, Ticket
 from demandops.serve.generator import Generator
+from demandops.serve.journal import Journal, Receipt, Ticket
 
 from tests.kit import sync
 from tests.kit.limits import PATIENCE_S

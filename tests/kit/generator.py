@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from demandops.base.errors import InvalidInput
-from demandops.serve.demands import Receipt, Ticket
+from demandops.repo.slot import Slot
 from demandops.serve.generator import Generator
+from demandops.serve.journal import Receipt, Ticket, open_journal
 
 from tests.kit.goals import Goal
 from tests.kit.limits import PATIENCE_S
@@ -44,9 +45,18 @@ def outcome(ticket: Ticket) -> str:
     return type(error).__name__ if error else receipt(ticket).outcome
 
 
-def journaled(operation: str, goal: object, received: str, base: str) -> dict[str, object]:
-    """Return a line of the journal of a generator that died before it answered a demand."""
-    return {"operation": operation, "goal": goal, "received": received, "base": base}
+def journaled(operation: str, goal: object, received: str, base: str) -> Ticket:
+    """Return a ticket as in the journal of a generator that died before it answered a demand."""
+    data = {"operation": operation, "goal": goal, "received": received, "base": base}
+    return Ticket.from_data(data)
+
+
+def leave_in_journal(folder: Path, *tickets: Ticket) -> None:
+    slot = Slot(folder)
+    journal = open_journal(slot.folder)
+    journal.append(tickets)
+    journal.close()
+    slot.close()
 
 
 def wait_until_queued(tickets: Iterable[Ticket]) -> None:

@@ -8,6 +8,7 @@ from tests.kit.generator import (
     book,
     busy,
     journaled,
+    leave_in_journal,
     outcome,
     receipt,
     restart,

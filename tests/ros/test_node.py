@@ -22,7 +22,7 @@ from demandops.base.errors import NotReached
 from demandops.base.quoting import is_visible
 from demandops.base.settings import DEFAULT_ACTION_NAME
 from demandops.cluster.health import Health
-from demandops.serve.demands import Receipt
+from demandops.serve.journal import Receipt
 from demandops_interfaces.srv import GetBookkeeping
 from demandops_ros.actions import DemandAdapter
 from demandops_ros.demand_node import awaits_releases, rollout_answer

@@ -25,7 +25,7 @@ from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import in_turn
-from demandops.serve.agenda import LeaseExpiry, RateLimit
+from demandops.serve.agenda import Agenda, RateLimit
 from pydantic import Field, model_validator
 
 from tests.kit import plain_yaml
@@ -177,7 +177,7 @@ class World(MemoryRepo):
         self.files = {**self._initial, **ledger, **rendered_files(self.state)}
 
     def restart(self) -> None:
-        self._lease_clock = LeaseExpiry(self.clock)
+        self._lease_clock = Agenda(0, self.clock)
         self._throttle = RateLimit()
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:

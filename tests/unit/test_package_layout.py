@@ -93,15 +93,14 @@ def test_a_launch_file_uses_all_its_arguments(name: str, program: str) -> None:
 
 
 def test_the_parameter_files_have_the_defaults() -> None:
-    node = pytest.importorskip("demandops_ros.node_parameters").DEFAULTS
-    command = pytest.importorskip("demandops_ros.detector.detector_node")
-    detector = {name: default for name, (default, *_) in command.PARAMETERS.items()}
+    node = pytest.importorskip("demandops_ros.node_parameters").PARAMETERS
+    detector = pytest.importorskip("demandops_ros.detector.detector_node").PARAMETERS
     of_node = (node, {"state_repo", "fetch_interval", "log_level"})
     of_detector = (detector, {"rules", "log_level"})
     for file, (defaults, left_out) in {"params": of_node, "detector_params": of_detector}.items():
         data: dict[str, Any] = yaml.safe_load((PACKAGE / "config" / f"{file}.yaml").read_text())
         named = data["/**"]["ros__parameters"]
-        assert named == {name: defaults[name] for name in defaults.keys() - left_out}
+        assert named == {name: defaults[name].default for name in defaults.keys() - left_out}
 
 
 def test_the_package_has_the_version_and_the_needs_of_the_code() -> None:

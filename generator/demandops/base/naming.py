@@ -184,6 +184,7 @@ PATTERN_WORDS = {
     r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$": "the tag of an image, such as v1.2.0",
     r"^[A-Z][A-Za-z0-9]*$": "a kind of Kubernetes object, such as ConfigMap",
     r"^([a-z0-9]([a-z0-9.-]*[a-z0-9])?)?$": "the group of an API, such as batch, or nothing",
+    r"^[^<>\s][^<>\n]* <[^<>\s]+@[^<>\s]+>$": "a name and an address, like Ann <ann@example.org>",
     r"^values/[A-Za-z0-9_.-]+$": "a file of the folder values/, such as values/service.yaml.j2",
     r"^[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*$": (
         f"one or more parts with '/' between them (fleet/one), each of {_ANY}, '_' and '-'"

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
+
+from demandops.base.errors import StateRepoError
 
 # `apiVersion` of every configuration file
 API_VERSION: Final = "demandops/v1"
@@ -74,22 +77,35 @@ def documentation() -> Path | None:
     return next((folder for folder in folders if (folder / "index.html").is_file()), None)
 
 
-def forge_token_file() -> Path | None:
-    named = os.environ.get("DEMANDOPS_FORGE_TOKEN_FILE")
+def _named_file(variable: str) -> Path | None:
+    named = os.environ.get(variable)
     return Path(named).expanduser() if named else None
+
+
+def forge_token_file() -> Path | None:
+    return _named_file("DEMANDOPS_FORGE_TOKEN_FILE")
 
 
 def alive_file() -> Path | None:  # a generator touches it as long as it works
-    named = os.environ.get("DEMANDOPS_ALIVE_FILE")
-    return Path(named).expanduser() if named else None
+    return _named_file("DEMANDOPS_ALIVE_FILE")
+
+
+def folder_of_user(variable: str, below_home: str) -> Path:
+    # https://specifications.freedesktop.org/basedir-spec ignores relative paths
+    named = Path(os.environ.get(variable) or ".")
+    if named.is_absolute():
+        return named
+    home = Path(os.environ.get("HOME") or os.path.expanduser("~"))  # noqa: PTH111 - raises no error
+    if not home.is_absolute():
+        raise StateRepoError(f"there is no home folder; set HOME or {variable} to a folder")
+    return home / below_home
 
 
 def data_home(state_repo: str) -> Path:  # for the generator's journal and clone
-    if Path(state_repo).exists():  # all spellings of a path give the same folder
-        state_repo = str(Path(state_repo).resolve())
-    root: str | Path | None = os.environ.get("DEMANDOPS_DATA_HOME")
-    if not root:
-        state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-        root = Path(state) / "demandops"
+    with suppress(OSError):
+        if Path(state_repo).exists():  # all spellings of a path give the same folder
+            state_repo = str(Path(state_repo).resolve())
+    named = os.environ.get("DEMANDOPS_DATA_HOME")
+    root = Path(named) if named else folder_of_user("XDG_STATE_HOME", ".local/state") / "demandops"
     # a digest, because the address may contain a password
-    return Path(root) / hashlib.sha256(state_repo.encode()).hexdigest()[:16]
+    return root / hashlib.sha256(os.fsencode(state_repo)).hexdigest()[:16]

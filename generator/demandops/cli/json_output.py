@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from datetime import datetime
@@ -78,7 +79,13 @@ def show(output: str, data: object, text: Iterable[str | Table]) -> None:
 
 
 def print_json(data: object) -> None:
-    click.echo(json_escaped(json.dumps(data, indent=2, ensure_ascii=False)))
+    click.echo(json_text(data, indent=2))
+
+
+def json_text(data: object, indent: int | None = None) -> str:
+    # escaped where the terminal or a pipe takes no Unicode
+    takes_all = (sys.stdout.encoding or "").lower().startswith("utf")
+    return json_escaped(json.dumps(data, indent=indent, ensure_ascii=not takes_all))
 
 
 def faults_of(error: DemandOpsError) -> list[Json]:

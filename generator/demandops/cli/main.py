@@ -5,20 +5,23 @@ A command's module is imported when the command runs, so that `--version` and `-
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import shutil
 import signal
 import sys
 from contextlib import suppress
 from enum import IntEnum
 from importlib import import_module
+from pathlib import Path
 
 import click
 
 from demandops import __version__
 from demandops.base.errors import DemandOpsError, InvalidInput, Unsound
-from demandops.base.quoting import OneLineFormatter
-from demandops.cli.output import errors, show_slow
+from demandops.base.quoting import OneLineFormatter, one_line
+from demandops.cli.output import OutputLost, done, errors, open_streams, show_slow
 from demandops.repo.git import slow_git
 
 # The package of each command's module, and the short help, which `--help` shows without importing
@@ -69,8 +72,11 @@ COMMANDS = {
 # progress of git operations.
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
 
-# Errors about a file: its path is wrong, or permissions are missing.
-_OF_A_PATH = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
+_REMEDIES = {
+    errno.EMFILE: "raise the limit of open files (ulimit -n), then try again",
+    errno.ENOSPC: "make room on the disk, then try again",
+}
+_REMEDY = "check this path and the current folder, then try again"
 
 
 class ExitCode(IntEnum):
@@ -95,9 +101,9 @@ def load(name: str) -> click.Command:
         raise click.ClickException(
             f"{name} needs {missing}, which is not installed; {remedy}"
         ) from None
-    except ImportError:
+    except ImportError as error:
         if shutil.which("git"):
-            raise
+            raise click.ClickException(f"{name} does not start: {one_line(str(error))}") from error
         raise click.ClickException(
             f"{name} needs git, which is not installed; install it (Debian: apt-get install git)"
         ) from None
@@ -136,27 +142,49 @@ def cli(verbose: bool) -> None:
 
 
 def main(args: list[str] | None = None) -> None:
-    sys.exit(run(args))
+    # the only door of all programs: `demandops`, and the nodes that ROS starts
+    open_streams()
+    code = run(args)
+    try:
+        sys.stdout.flush()
+    except OutputLost:  # it is told already, and Python would tell it again at the exit
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    sys.exit(code)
 
 
 def run(args: list[str] | None = None) -> int:
-    # SIGTERM acts like Ctrl-C, because both must close generators and remove temporary folders
-    before = signal.getsignal(signal.SIGTERM)
-    with suppress(ValueError):  # only the main thread may set a handler
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # SIGTERM and SIGHUP act like Ctrl-C, because all of them must close generators and remove
+    # temporary folders; but `nohup` lets a process ignore SIGHUP
+    before = {}
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        with suppress(ValueError):  # only the main thread may set a handler
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                before[number] = signal.signal(number, signal.default_int_handler)
+    done.clear()
     try:
-        return _run(args)
+        return _run(sys.argv[1:] if args is None else args)
     finally:
-        with suppress(ValueError):
-            signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-def _run(args: list[str] | None) -> int:
+def _run(args: list[str]) -> int:
     try:
+        if odd := [arg for arg in args if any("\udc80" <= char <= "\udcff" for char in arg)]:
+            raise click.ClickException(
+                f"the argument {odd[0]!a} is no text in {sys.getfilesystemencoding()}; write it in "
+                "UTF-8, with a locale of UTF-8 such as LANG=C.UTF-8"
+            )
+        try:
+            Path.cwd()
+        except OSError:
+            message = "the current folder no longer exists; change to one that does"
+            raise click.ClickException(message) from None
         code = cli.main(args=args, prog_name="demandops", standalone_mode=False)
         return code if isinstance(code, int) else ExitCode.DONE
     except click.UsageError as error:
-        error.show()
+        with suppress(OSError):
+            error.show()
         return ExitCode.WRONG_USAGE
     except click.Abort:
         # a terminal has shown ^C in this line
@@ -165,23 +193,25 @@ def _run(args: list[str] | None) -> int:
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")
         return ExitCode.USER_ERROR
-    except Unsound as error:
-        errors.print(f"error: {error}")
-        return ExitCode.PROGRAM_ERROR
     except DemandOpsError as error:
         for fault in error.faults if isinstance(error, InvalidInput) else [error]:
             errors.print(f"error: {fault}")
+        return ExitCode.PROGRAM_ERROR if isinstance(error, Unsound) else ExitCode.USER_ERROR
+    except OutputLost as error:
+        if not done and isinstance(error.__cause__, BrokenPipeError):  # `demandops log | head`
+            return ExitCode.DONE
+        told = f"; done already: {'; '.join(done)}" if done else ""
+        errors.print(f"error: the output cannot be written: {error}{told}")
         return ExitCode.USER_ERROR
-    except BrokenPipeError:  # `demandops log | head`; Python would report it again at the exit
-        sys.stderr.close()
-        return ExitCode.DONE
+    except OSError as error:  # of a file, a folder or the machine's limits
+        place = (
+            f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes) else ""
+        )
+        reason = error.strerror or str(error)
+        errors.print(f"error: {place}{reason}; {_REMEDIES.get(error.errno or 0, _REMEDY)}")
+        logging.getLogger("demandops").info("traceback", exc_info=True)
+        return ExitCode.USER_ERROR
     except Exception as error:
-        if isinstance(error, _OF_A_PATH) and error.filename:
-            errors.print(
-                f"error: {error.filename}: {error.strerror}; check this path, then try again"
-            )
-            logging.getLogger("demandops").info("traceback", exc_info=True)
-            return ExitCode.USER_ERROR
         logging.getLogger("demandops").debug("a fault of the program", exc_info=True)
         errors.print(
             f"error: a fault of demandops itself: {type(error).__name__}: {error}\n"

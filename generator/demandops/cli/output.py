@@ -5,11 +5,12 @@ Functions that need `rich` import it themselves, because `demandops --help` impo
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -19,7 +20,6 @@ from demandops.base.runtime import REAL
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress as Bar
     from rich.text import Text
 
     from demandops.repo.load.snapshot import Snapshot
@@ -42,6 +42,48 @@ def console(stderr: bool = False) -> Console:
     width = None if stream.isatty() else 200
     # rich would take [bold] and :smile: in the texts of people for its own markup
     return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
+
+
+# What the command has changed already, to be told if its output cannot be written.
+done: list[str] = []
+
+
+class OutputLost(Exception):
+    """Raised when the standard output is closed or full; no library catches it by chance."""
+
+
+class _Output(io.TextIOWrapper):
+    def write(self, text: str, /) -> int:
+        try:
+            return super().write(text)
+        except OSError as error:
+            raise OutputLost(error.strerror) from error
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except OSError as error:
+            raise OutputLost(error.strerror) from error
+
+
+def open_streams() -> None:
+    """Give the process three standard streams, of which none raises an error of its encoding."""
+    # The next file would get the number of a closed one, and what a child prints would land in it.
+    # What is opened for reading refuses each write, and so tells that the output was closed.
+    for number, mode in enumerate((os.O_RDONLY, os.O_RDONLY, os.O_WRONLY)):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, mode)
+    sys.stdin = sys.stdin or open(0, closefd=False)  # noqa: SIM115
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)  # noqa: SIM115
+    stream = sys.stdout or open(1, "w", closefd=False)  # noqa: SIM115
+    assert isinstance(stream, io.TextIOWrapper)  # noqa: S101
+    assert isinstance(sys.stderr, io.TextIOWrapper)  # noqa: S101
+    encoding, is_terminal = stream.encoding, stream.isatty()
+    raw = stream.detach()
+    sys.stdout = _Output(raw, encoding, "backslashreplace", line_buffering=is_terminal)
+    sys.stderr.reconfigure(errors="backslashreplace")
 
 
 # What is printed before the name of a changed release or entry.
@@ -75,7 +117,8 @@ def print_lines(lines: list[str]) -> None:
 
 class _Errors:
     def print(self, text: str) -> None:
-        click.echo(quoting.lines(text), err=True)
+        with suppress(OSError):  # nothing else can tell it
+            click.echo(quoting.lines(text), err=True)
 
 
 errors = _Errors()
@@ -138,57 +181,36 @@ def show_slow(text: str) -> None:  # an empty text clears the line
 
 
 @contextmanager
-def busy(title: str) -> Iterator[Callable[[str], None]]:
-    # on a terminal, the title and the elapsed seconds, if the block takes a second or longer; the
-    # function that it yields replaces the title
-
-    def say(text: str) -> None:
-        nonlocal title
-        title = text
-
-    if not sys.stderr.isatty():
-        yield say
-        return
-    ended, shown = REAL.event(), REAL.event()
+def busy(title: str) -> Iterator[None]:
+    # on a terminal, the title and the elapsed seconds, if the block takes a second or longer
+    ended = REAL.event()
 
     def tick() -> None:
         seconds = 0
         while not ended.wait(1):
             seconds += 1
-            shown.set()
             show_slow(f"{title}, {seconds} s")
 
-    thread = REAL.start_thread("busy", tick)
+    thread = REAL.start_thread("busy", tick) if sys.stderr.isatty() else None
     try:
-        yield say
+        yield
     finally:
         ended.set()
-        thread.join()
-        if shown.is_set():
+        if thread is not None:
+            thread.join()
             show_slow("")
 
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    # a progress bar on a terminal, if the work takes long
+    # on a terminal, how far the work is, if it takes long
     start = REAL.monotonic()
-    bar: Bar | None = None
-    task: Any = None
 
-    def show(done: int, total: int) -> None:
-        nonlocal bar, task
-        if bar is None:
-            if not sys.stderr.isatty() or REAL.monotonic() - start < 0.5 or done >= total:
-                return
-            from rich.progress import Progress as Bar  # noqa: PLC0415
-
-            bar = Bar(console=console(stderr=True), transient=True)
-            task = bar.add_task(title, total=total)
-            bar.start()
-        bar.update(task, completed=done, total=total)
+    def report(done: int, total: int) -> None:
+        if REAL.monotonic() - start >= 0.5:
+            show_slow(f"{title}, {done} of {total}")
 
     try:
-        yield show
+        yield report
     finally:
-        if bar is not None:
-            bar.stop()
+        show_slow("")

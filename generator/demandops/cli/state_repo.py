@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,13 +15,14 @@ from demandops.base.runtime import REAL
 from demandops.cli import target
 from demandops.cli.authoring import schema
 from demandops.cli.json_output import Json, output_option, show
-from demandops.cli.output import Progress, busy, errors, progress
+from demandops.cli.output import busy, done, errors, progress
 from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
 from demandops.repo.git.signing import Signer
 from demandops.repo.upgrade import Upgrade, UpgradeRequest
-from demandops.repo.write.journal import find_journals
+from demandops.serve.journal import drop as drop_demand
+from demandops.serve.journal import find_journals
 from demandops.templating.evaluator import processor_time
 
 # ---- ``demandops init``: a new state repo ----
@@ -100,6 +100,7 @@ def init(
             schemas={name: schema.text(name) for name in schema.SCHEMAS},
             signer=Signer(signing_key) if signing_key else None,
         )
+    done.append(f"state repo in {directory}")
     data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
     lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
     if not url:
@@ -188,15 +189,16 @@ def upgrade(
     now = REAL.now()
     signer = Signer(signing_key) if signing_key and not dry_run else None
     if dry_run or asks:
-        with _shown() as report:
+        with progress("reading the ledger") as report:
             result = upgrading.plan(state_repo, request, now, report)
     if asks and not dry_run and result.switches:
         show(output, None, [_SWITCH])
         if not click.confirm("Are those before it done?"):
             raise click.ClickException("nothing was changed; do these steps first, or give --yes")
     if not dry_run:
-        with _shown() as report:
+        with progress("reading the ledger") as report:
             result = upgrading.upgrade(state_repo, request, now, report, signer)
+            done.extend([f"upgraded in {result.commit}"] if result.files else [])
     old, new = result.old.repo_settings, result.new.repo_settings
     outcome = "unchanged" if not result.files else "would-change" if dry_run else "upgraded"
     data = {
@@ -209,17 +211,6 @@ def upgrade(
         "after": _steps_after(result),
     }
     show(output, data, _upgrade_lines(result, dry_run))
-
-
-@contextmanager
-def _shown() -> Iterator[Progress]:
-    with busy("reading the state repo") as say:
-
-        def report(done: int, total: int) -> None:
-            read = f"reading the ledger, {done} of {total} files"
-            say(read if done < total else "rendering everything")
-
-        yield report
 
 
 def _steps_after(result: Upgrade) -> list[Json]:
@@ -342,31 +333,42 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     help="Rename journals that are damaged, so that the generator starts without them. A journal "
     "that a running generator uses keeps its name.",
 )
+@click.option(
+    "--drop",
+    metavar="ID",
+    help="Give up the demand with this operation id. If a generator runs, it answers the demand's "
+    "requester.",
+)
 @output_option
-def journal(state_repo: str, set_aside: bool, output: str) -> None:
+def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> None:
     """List the accepted demands that are not published.
 
     A generator on this machine accepted these demands. If it still runs, it carries them out.
     Otherwise the next generator that starts here for the state repo does. If a journal is damaged,
     no generator starts, because the journal may lack demands. In this case, use --set-aside, and
-    send again the listed demands that are still needed. --output json prints their goals.
+    send again the listed demands that are still needed. --output json prints their goals. A demand
+    that shall not be carried out is given up with --drop.
 
     \b
     Examples:
       demandops journal
       demandops journal --set-aside
+      demandops journal --drop 5e0c1b0e-6d7f-4a39-9d4f-0f6f0c1f7a52
     """
     folder = settings.data_home(state_repo)
+    if drop is not None:
+        _drop(folder, drop, output)
+        return
     journals = list(find_journals(folder, REAL.now(), set_aside=set_aside))
     rows, lines = [], []
     for each in journals:
         demands = [
             {
-                "operation_id": record["operation"],
-                "received": record["received"],
-                "goal": record["goal"],
+                "operation_id": ticket.operation,
+                "received": ticket.received.isoformat(),
+                "goal": ticket.demand.goal,
             }
-            for record in each.demands
+            for ticket in each.demands
         ]
         rows.append(
             {
@@ -376,16 +378,32 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
                 "demands": demands,
             }
         )
-        lines += [
-            f"{record['operation']}  received {record['received']}" for record in each.demands
-        ]
+        lines += [f"{demand['operation_id']}  received {demand['received']}" for demand in demands]
         if each.set_aside:
             lines.append(f"the damaged journal {each.file} is now called {each.set_aside}")
+        elif each.damage:
+            errors.print(f"error: {each.damage}")
     number = sum(len(each.demands) for each in journals)
     what = "demand is" if number == 1 else "demands are"
     show(output, rows, [*lines, f"{number} {what} accepted and not published"])
-    damages = [each.damage for each in journals if each.damage and not each.set_aside]
-    for damage in damages:
-        errors.print(f"error: {damage}")
-    if damages:
+    if any(each.damage and not each.set_aside for each in journals):
         raise click.exceptions.Exit(1)
+
+
+_DROP_S = 15.0
+
+
+def _drop(folder: Path, operation: str, output: str) -> None:
+    request, end = drop_demand(folder, operation), REAL.monotonic() + _DROP_S
+    while request and request.exists() and REAL.monotonic() < end:
+        REAL.sleep(0.1)
+    outcome = "dropped" if not request else "requested" if request.exists() else "answered"
+    text = {
+        "dropped": "is given up; if its generator died after the push, it is booked, which "
+        "`demandops log` shows",
+        "answered": "has its answer from the generator that runs, whose log has it too",
+        "requested": "is given up by the generator that runs as soon as the state repo shows that "
+        "no push of it has arrived",
+    }
+    data = {"operation_id": operation, "outcome": outcome}
+    show(output, data, [f"demand {operation} {text[outcome]}"])

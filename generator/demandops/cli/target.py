@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -12,11 +11,10 @@ import click
 from click.core import ParameterSource
 from pydantic import Field, StringConstraints, model_validator
 
-from demandops.base import strict_yaml
-from demandops.base.errors import InvalidInput, suggestion
+from demandops.base import settings, strict_yaml
+from demandops.base.errors import InvalidInput, StateRepoError, suggestion
 from demandops.base.naming import SubjectKind
 from demandops.base.quoting import quoted
-from demandops.base.settings import API_VERSION
 from demandops.base.strict_yaml import located_in
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, parse_file
 from demandops.repo import reader
@@ -59,15 +57,14 @@ class ContextsFile(FileModel):
 
 
 def contexts_file() -> Path:
-    root = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
-    return Path(root) / "demandops" / "contexts.yaml"
+    return settings.folder_of_user("XDG_CONFIG_HOME", ".config") / "demandops" / "contexts.yaml"
 
 
 def read_contexts() -> ContextsFile:
     try:
         text = contexts_file().read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return ContextsFile(apiVersion=API_VERSION, kind="Contexts")
+    except (FileNotFoundError, StateRepoError):  # there is no such file, or no home folder
+        return ContextsFile(apiVersion=settings.API_VERSION, kind="Contexts")
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidInput.at(
             "", f"cannot be read: {error}; replace the file", file=str(contexts_file())

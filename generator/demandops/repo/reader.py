@@ -28,8 +28,8 @@ from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Problem, Progress, Snapshot
+from demandops.repo.slot import Slot
 from demandops.repo.verification import Verdict
-from demandops.repo.write.journal import Slot
 
 
 class Reader:

@@ -20,11 +20,8 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, OrderedDict, deque
-from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass, field, replace
-from datetime import datetime
-from typing import Literal
+from collections.abc import Collection, Hashable, Iterable, Sequence
+from dataclasses import replace
 
 from demandops.base import errors
 from demandops.base.errors import (
@@ -37,135 +34,9 @@ from demandops.base.errors import (
 )
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
-from demandops.cluster.health import Target
-from demandops.decide.decision import Outcome
-from demandops.model.demand.demand import Demand
-from demandops.model.demand.goals import read_journaled
-from demandops.model.ledger.ledger import ClaimChange
-from demandops.repo.write.journal import Journal, ProposalRecord, Record
-
-# ---- a demand under way, from its submission to its receipt ----
+from demandops.serve.journal import Journal, ProposalRecord, Receipt, State, Ticket
 
 log = logging.getLogger("demandops")
-
-# What a demand's listener is told.
-Stage = Literal[
-    "away",  # the state repo cannot be reached or written now
-    "admitted",  # the demand is valid
-    "booked",  # its claims are computed, but not committed yet
-    "waiting",  # no node has room for it, so it will be booked later
-    "committed",  # it has a commit
-    "proposed",  # it awaits a person's approval
-    "pushed",  # the commit in its receipt is published
-    # Its answer is an error. Not told if the demand was not accepted, was taken back by its client,
-    # or stays in the journal.
-    "refused",
-]
-Listener = Callable[[Stage, str], None]
-
-# Only :class:`Demands` changes the state of a demand.
-State = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done"]
-
-
-@dataclass(frozen=True, slots=True)
-class Receipt:
-    # of a demand whose commit is published and durable; if an earlier attempt or run published it,
-    # only the first four fields are known
-    operation: str
-    request_id: str
-    outcome: Outcome
-    commit: str  # of a demand that changed nothing, the newest one on which it was decided
-    warnings: tuple[str, ...] = ()
-    not_held: tuple[str, ...] = ()
-    placed: tuple[str, ...] = ()  # which nodes the generator chose, and why
-    lease_s: int | None = None
-    targets: tuple[Target, ...] = ()  # the releases to follow, if the generator was asked for them
-    changes: tuple[ClaimChange, ...] = ()
-
-
-@dataclass(eq=False)
-class Ticket:
-    operation: str
-    demand: Demand
-    received: datetime
-    listener: Listener = lambda stage, text: None
-    future: Future[Receipt] = field(default_factory=Future)
-    # True once a crash cannot lose the demand; false if it was refused without being journaled.
-    journaled: Future[bool] = field(default_factory=Future)
-    # A tip that does not include the demand; only later commits may record the demand.
-    base: str = ""
-    # Whether the remote may have accepted a push of the demand although no answer arrived.
-    maybe_published: bool = False
-    # Whether this demand released one that awaited approval: then it succeeds even if it ends no
-    # claim.
-    has_released: bool = False
-    state: State = "queued"
-    # while it is in the queue: its place in the order of arrival, and what it touches (None: any)
-    number: int = 0
-    subjects: frozenset[Hashable] | None = None
-    notified: set[str] = field(default_factory=set)
-    proposal: ProposalRecord | None = None
-
-    def __post_init__(self) -> None:
-        for future in (self.future, self.journaled):
-            future.set_running_or_notify_cancel()  # a demand is withdrawn, not canceled
-
-    @property
-    def requester(self) -> str:  # the first; empty if there is none
-        return next(iter(self.demand.requesters()), "")
-
-    def refuse(self, error: DemandOpsError) -> None:
-        # only a demand that is not in the journal yet
-        self.state = "done"
-        self.future.set_exception(error)
-        self.journaled.set_result(False)
-
-    def notify(self, stage: Stage, text: str) -> None:
-        # A stage is reported once, although a demand is evaluated again after each lost race. But a
-        # proposal has another text once its pull request is known.
-        key = text if stage == "proposed" else stage
-        if key in self.notified:
-            return
-        self.notified.add(key)
-        try:
-            self.listener(stage, text)
-        except Exception:
-            log.exception("a listener failed")
-
-    def mark_maybe_published(self, base: str) -> None:
-        if not self.maybe_published:  # the oldest base counts, because any try may have succeeded
-            self.base, self.maybe_published = base, True
-
-    def record(self, proposal: ProposalRecord | None = None) -> Record:
-        # for the journal
-        return {
-            "operation": self.operation,
-            "goal": self.demand.goal,
-            "received": self.received.isoformat(),
-            "base": self.base,
-            **({"proposal": proposal} if proposal else {}),
-        }
-
-
-def ticket_from_journal(record: Record) -> Ticket:
-    demand = read_journaled(record["goal"])
-    ticket = Ticket(record["operation"], demand, datetime.fromisoformat(record["received"]))
-    name = f"demand {ticket.operation} ({quoted(demand.id)}) from the journal"
-
-    def tell(stage: Stage, text: str) -> None:
-        if stage in ("proposed", "pushed"):
-            log.info("%s: %s", name, text)
-        elif stage == "refused":
-            log.error("%s: refused: %s", name, text)
-
-    ticket.listener = tell
-    ticket.journaled.set_result(True)
-    ticket.mark_maybe_published(record["base"])  # the earlier run may have ended after the push
-    if (proposal := record.get("proposal")) is not None:
-        ticket.proposal = proposal
-        ticket.state = "withdrawn" if proposal.withdrawn else "proposed"
-    return ticket
-
 
 # ---- the queue of demands: requesters take turns, and related demands keep their order ----
 #
@@ -262,6 +133,9 @@ class FairQueue:
 # ---- the states of the demands ----
 
 TAKEN_BACK = "the demand was taken back before it was committed"
+GIVEN_UP = "the demand was given up by `demandops journal --drop`"
+# The seconds between two looks for such requests.
+_LOOK_S = 1.0
 
 _NEXT: dict[State, tuple[State, ...]] = {
     "arrived": ("queued", "done"),
@@ -282,13 +156,13 @@ class Demands:
         self._limit, self._requester_limit = limit, requester_limit
         self._of_requester = Counter[str]()
         self._changed = runtime.condition()
-        resumed = [ticket_from_journal(record) for record in journal.pending.values()]
-        self._tickets = {ticket.operation: ticket for ticket in resumed}
+        self._tickets = dict(journal.pending)
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
         self._queue = FairQueue(in_order=requester_limit is None)
-        for ticket in resumed:
+        for ticket in self._tickets.values():
+            log.info("resuming demand %s from the journal", ticket.operation)
             if ticket.proposal is None:
                 self._enqueue(ticket)
         self._taken_back: list[Ticket] = []
@@ -296,13 +170,9 @@ class Demands:
         # Why no demand can be published now, or empty. QueueFull quotes it: a queue that is full
         # behind a remote that is away needs another remedy than a client that sends too much.
         self.blocked = ""
+        self._give_up_what_is_dropped()  # before the worker begins
 
     # ---- queries ----
-
-    @property
-    def operations(self) -> tuple[str, ...]:
-        with self._changed:
-            return tuple(self._tickets)
 
     @property
     def proposed(self) -> list[Ticket]:
@@ -314,7 +184,7 @@ class Demands:
     def unpublished(self) -> int:
         """The number of demands still to publish: those in the journal that await no approval."""
         with self._changed:
-            return sum(1 for each in self._journal.pending.values() if "proposal" not in each)
+            return sum(not ticket.proposal for ticket in self._journal.pending.values())
 
     @property
     def has_queued(self) -> bool:
@@ -386,9 +256,10 @@ class Demands:
     def journal_arrivals(self) -> None:
         # demands that arrive during an fsync of the journal share the next fsync
         while not self.is_closed:
-            self._arrival.wait()
+            self._arrival.wait(_LOOK_S)
             self._arrival.clear()
             self._take_in()
+            self._give_up_what_is_dropped()
 
     def _take_in(self) -> None:
         if not self._arrived:
@@ -404,7 +275,7 @@ class Demands:
                 self._tickets[ticket.operation] = ticket
                 taken.append(ticket)
             try:
-                self._journal.append(ticket.record() for ticket in taken)
+                self._journal.append(taken)
             except Exception as failure:
                 if isinstance(failure, DemandOpsError):
                     why = failure
@@ -458,17 +329,25 @@ class Demands:
         with self._changed:
             if "proposed" not in _NEXT[ticket.state]:
                 return False
-            self._journal.append([ticket.record(record)])
-            self._leave(ticket)
-            ticket.proposal = record
+            was_proposed = ticket.proposal is not None
+            self._note(ticket, record)
+            if not was_proposed:
+                self._leave(ticket)
             return _change(ticket, "proposed")
+
+    def _note(self, ticket: Ticket, proposal: ProposalRecord | None) -> None:
+        before, ticket.proposal = ticket.proposal, proposal
+        try:
+            self._journal.append([ticket])
+        except BaseException:
+            ticket.proposal = before
+            raise
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
         with self._changed:
             for ticket in tickets:
                 ticket.mark_maybe_published(ticket.base)  # a person may have merged it meanwhile
-                self._journal.append([ticket.record()])
-                ticket.proposal = None
+                self._note(ticket, None)
                 _change(ticket, "queued")
                 self._enqueue(ticket)
             self._changed.notify()
@@ -487,6 +366,20 @@ class Demands:
                 return False
         return True
 
+    def _give_up_what_is_dropped(self) -> None:
+        for request in self._journal.drop_requests():
+            with self._changed:
+                ticket = self._tickets.get(request.name.partition("-")[2])
+                if ticket is None:  # it is answered
+                    request.unlink()
+                elif ticket.state != "withdrawn":
+                    log.warning("%s: demand %s", GIVEN_UP, ticket.operation)
+                    # a push of a committed demand may have arrived, so the next attempt answers it
+                    if ticket.state == "committed":
+                        ticket.state, ticket.withdrawn = "withdrawn", GIVEN_UP
+                    else:
+                        self._withdraw(ticket, GIVEN_UP)
+
     def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
         with self._changed:
             for ticket in tickets:
@@ -498,10 +391,9 @@ class Demands:
             # a restart must not resume the withdrawn demand
             self._journal.mark_done([ticket.operation], durably=True)
             self._taken_back.append(ticket)
+            ticket.withdrawn = reason
         else:  # the demand stays in the journal until its branch is deleted
-            record = replace(ticket.proposal, withdrawn=reason)
-            self._journal.append([ticket.record(record)])
-            ticket.proposal = record
+            self._note(ticket, replace(ticket.proposal, withdrawn=reason))
         _change(ticket, "withdrawn")
         self.wake()  # the worker answers the demand even while nothing can be published
 
@@ -513,7 +405,7 @@ class Demands:
                 return
             self._queue.remove(withdrawn)
             batch[:] = [ticket for ticket in batch if ticket not in withdrawn]
-        self.fail(withdrawn, errors.Withdrawn(TAKEN_BACK))
+        self.answer((ticket, errors.Withdrawn(ticket.withdrawn)) for ticket in withdrawn)
 
     def answer(
         self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
@@ -551,7 +443,8 @@ class Demands:
                     self._journal.mark_done(operations)
             for ticket, _ in results:
                 _change(ticket, "done")
-                if self._tickets.pop(ticket.operation, None):
+                # a proposed demand left the count of its requester already
+                if self._tickets.pop(ticket.operation, None) and ticket.proposal is None:
                     self._leave(ticket)
         for ticket, result in results:
             if isinstance(result, Receipt):
@@ -574,10 +467,8 @@ class Demands:
         self._queue.append(ticket)
 
     def _leave(self, ticket: Ticket) -> None:
-        # a proposed demand left the count of its requester already
-        if ticket.proposal is None:
-            # this difference drops a requester at 0, so that passing vehicles leave nothing behind
-            self._of_requester -= Counter([ticket.requester])
+        # this difference drops a requester at 0, so that passing vehicles leave nothing behind
+        self._of_requester -= Counter([ticket.requester])
 
 
 def _change(ticket: Ticket, state: State) -> bool:

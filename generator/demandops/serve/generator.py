@@ -20,10 +20,11 @@ from demandops.repo.git.signing import Signer
 from demandops.repo.history import revisions
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress, Snapshot
-from demandops.repo.write.journal import Slot
+from demandops.repo.slot import Slot
 from demandops.serve.agenda import heartbeat_in
 from demandops.serve.approvals.approvals import Approvals
-from demandops.serve.demands import Demands, Listener, Ticket
+from demandops.serve.demands import Demands
+from demandops.serve.journal import Listener, Ticket, open_journal
 from demandops.serve.worker import RemoteStatus, Worker
 
 log = logging.getLogger("demandops")
@@ -67,6 +68,10 @@ class Generator:
         except OSError as error:
             raise access_error(error, f"the data folder of {state_repo}") from None
         try:
+            try:
+                self._journal = open_journal(self._slot.folder)
+            except OSError as error:
+                raise access_error(error, f"the data folder of {state_repo}") from None
             repository = connect(
                 state_repo, self._slot.folder, log.info, allow_offline=start_offline
             )
@@ -90,7 +95,7 @@ class Generator:
             raise
         self._repository, self._runtime = repository, runtime
         self.address = repository.address
-        self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime)
+        self._demands = Demands(self._journal, queue_limit, requester_limit, runtime)
         token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,
@@ -105,8 +110,6 @@ class Generator:
         self.includes, self.unchanged = repository.includes, repository.unchanged
         self._finished: Future[bool] | None = None
         self._stop_lock = runtime.lock()
-        for operation in self.operations:
-            log.info("resuming demand %s from the journal", operation)
         self._threads = [
             runtime.keep_running("writer", self._worker.run),
             runtime.keep_running("journal", self._demands.journal_arrivals),
@@ -133,10 +136,6 @@ class Generator:
         return self._demands.unpublished
 
     @property
-    def operations(self) -> tuple[str, ...]:
-        return self._demands.operations
-
-    @property
     def failures(self) -> dict[str, str]:
         return self._runtime.failures
 
@@ -161,7 +160,7 @@ class Generator:
             message = f"{operation!r} is not an operation id; use at most 100 letters, digits, "
             message += "dashes, dots and underscores"
             raise ValueError(message)
-        ticket = Ticket(operation, _UNREAD, self._runtime.now(), listener)
+        ticket = Ticket(operation, _UNREAD, self._runtime.now(), listener=listener)
         limits = self.snapshot.state.config.repo_settings.limits
         try:
             # here, so that what cannot be read is not journaled, and does not wait in the queue
@@ -204,6 +203,7 @@ class Generator:
                 finished.set_result(False)
                 return
             unpublished = self._demands.unpublished
+            self._journal.close()
             self._slot.close()
             finished.set_result(not unpublished)
 

@@ -42,7 +42,7 @@ from demandops.repo.load.ledger_files import restoration
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.agenda import (
-    FIRST_REST_S,
+    FIRST_PAUSE_S,
     LIMIT_LOCAL,
     LIMIT_REMOTE,
     LONGEST_EVALUATION_S,
@@ -54,7 +54,8 @@ from demandops.serve.agenda import (
     within,
 )
 from demandops.serve.approvals.approvals import Approvals, Result
-from demandops.serve.demands import TAKEN_BACK, Demands, Receipt, Ticket
+from demandops.serve.demands import TAKEN_BACK, Demands
+from demandops.serve.journal import Receipt, Ticket
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 log = logging.getLogger("demandops")
@@ -203,9 +204,9 @@ class Worker:
     def _seconds_until_judging(self) -> float:
         return max(0.0, self._judge_at - self._runtime.monotonic()) if self._must_judge else inf
 
-    def _due_in(self) -> dict[What, float]:
+    def _due_in(self, *, has_news: bool = False) -> dict[What, float]:
         main = str(self.snapshot.commit) if self._approvals.proposals else ""
-        return self._agenda.seconds_until_due(self.snapshot.state, main)
+        return self._agenda.due_in(self.snapshot.state, main, has_news=has_news)
 
     def _work(self) -> None:
         batch: list[Ticket] = []
@@ -216,7 +217,7 @@ class Worker:
                 self._publish(batch)
                 # without a claim that has ended, the configuration of main may be valid
                 self._must_judge = bool(self.snapshot.faults)
-            elif not self._agenda.rest_left_s:
+            elif not self._agenda.waits_s("all"):
                 self._follow()
             if self._must_judge and not self._seconds_until_judging:
                 self._must_judge, began = False, self._runtime.monotonic()
@@ -226,15 +227,14 @@ class Worker:
             if self._packs_since_tidy >= _TIDY_EVERY:
                 self._packs_since_tidy = 0
                 self._repository.tidy()
-            if self._approvals.proposals and not self._agenda.rest_left_s:
+            if self._approvals.proposals and not self._agenda.waits_s("all"):
                 self._check_proposals()
         except Exception as error:
             self._fail(
                 batch, access_error(error, self._repository.address, self._repository.objects)
             )
         else:
-            if not self._agenda.rest_left_s:
-                self._agenda.rest_s = FIRST_REST_S
+            if not self._agenda.waits_s("all"):
                 self._runtime.recovered(_NAME)
 
     def _fail(self, batch: list[Ticket], error: Exception) -> None:
@@ -249,12 +249,11 @@ class Worker:
             self._runtime.failed(_NAME, error)
         if not batch:
             # not at each failure in a row, because git then reads all objects
-            if self._agenda.rest_s == FIRST_REST_S:
+            if self._agenda.failed("all", first=FIRST_PAUSE_S) == FIRST_PAUSE_S:
                 try:
                     self._repository.renew_if_damaged()
                 except StateRepoError as damage:
                     log.warning("%s", damage)
-            self._agenda.rest()
             self._agenda.fetched(reached=False)
         if not isinstance(error, DemandOpsError):
             error = errors.internal(error)
@@ -387,7 +386,7 @@ class Worker:
         before = commits.head.state
         result = self._result_of(commits, ticket)
         # those that wait get the room that this demand frees before the next demand can take it
-        self._agenda.waiting_turns.follow(commits, before)
+        self._agenda.book_those_let_in(commits, before)
         return ticket, result
 
     def _result_of(  # noqa: PLR0912
@@ -397,7 +396,9 @@ class Worker:
         # only once the batch is published. Errors that concern all demands are raised; others leave
         # the rest of the batch alone.
         if ticket.state == "withdrawn":
-            return Withdrawn(TAKEN_BACK)
+            return Withdrawn(ticket.withdrawn or TAKEN_BACK)
+        if ticket.unread is not None:
+            return ticket.unread
         try:
             demand: Demand = ticket.demand
             if isinstance(demand, Rollback):
@@ -425,7 +426,7 @@ class Worker:
                 return decision
             # from here on the demand can no longer be taken back
             if not self._demands.commit(ticket):
-                return Withdrawn(TAKEN_BACK)
+                return Withdrawn(ticket.withdrawn or TAKEN_BACK)
             if decision.request.operation == "put":
                 self._approvals.withdraw_replaced(decision.request)
             if decision.outcome == "waiting":
@@ -506,9 +507,9 @@ class Worker:
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
         # a queued demand may renew a lease
-        if self._demands.has_queued or self._agenda.rest_left_s:
+        if self._demands.has_queued or self._agenda.waits_s("all"):
             return []
-        return self._agenda.leases.tickets(snapshot.state.ledger)
+        return self._agenda.lease_tickets(snapshot.state.ledger)
 
     def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
         # false, without answers, if another writer was first or locks main
@@ -595,11 +596,10 @@ class Worker:
             self._agenda.request_fetch()  # it is still due
         except StateRepoError as error:
             self._record_failure(error)
-            self._agenda.postpone()
+            self._agenda.failed("own work")
 
     def _check_proposals(self) -> None:
-        main, has_news = str(self.snapshot.commit), self._approvals.has_news
-        if not self._agenda.check_is_due(main, has_news=has_news):
+        if self._due_in(has_news=self._approvals.has_news)["check"] > 0:
             return
         try:
             self._agenda.check_begins()
@@ -632,7 +632,8 @@ class Worker:
             self._repository.refresh()
             # at random, so that generators which all saw the change do not collide again
             self._ends_soon.wait(self._runtime.uniform(0, 0.05))
-        self._agenda.postpone()  # other generators are faster, and they carry out the same changes
+        # other generators are faster, and they carry out the same changes
+        self._agenda.failed("own work")
         return False
 
     def _new_commit_batch(self, *, again: bool = False) -> CommitBatch:

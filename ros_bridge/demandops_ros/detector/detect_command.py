@@ -65,10 +65,10 @@ def detect(
             f"detect needs {error.name}, which is not installed; see README.md, 'With ROS 2'"
         ) from None
 
-    with ros_process.stop_signals() as wait_for_signal, ros_process.started(ros_args):
+    with ros_process.StopSignals() as signals, ros_process.started(ros_args):
         node = DetectorNode(rules)
         thread = ros_process.ExecutorThread(node)
-        wait_for_signal()
+        signals.wait()
         node.get_logger().info("stopping; the booked demands stay booked")
         thread.close()
         node.close()

@@ -24,9 +24,7 @@ from demandops.detect.detector import Detector, Outcome, Sending, Want, WantedDe
 from demandops.detect.observations import Key, MessageReader, Observation, Unreadable
 from demandops.detect.rule_file import Goal, RuleFile, read
 from demandops_interfaces.msg import Bookkeeping
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
-from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
@@ -35,68 +33,52 @@ from demandops_ros.actions import DemandError, GoalSender
 from demandops_ros.client import DemandClient
 from demandops_ros.demand_node import LATCHED, Diagnostics
 from demandops_ros.messages import fill_message
-from demandops_ros.node_parameters import LOG_LEVELS
+from demandops_ros.node_parameters import (
+    LOG_LEVEL,
+    Parameter,
+    declare,
+    read_parameters,
+    ros_name,
+    ros_name_or_none,
+)
 
 log = logging.getLogger("demandops")
 
 # ---- its parameters ----
 
-# Each parameter: its default, its description and, if it is a number, its range.
-PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
-    "rules": ("", "File of rules.", None),
-    "action_name": (
+PARAMETERS = {
+    "rules": Parameter("", "File of rules."),
+    "action_name": Parameter(
         DEFAULT_ACTION_NAME,
         "Name of the action DeploymentRequest, for rules that send it.",
-        None,
+        read=ros_name,
     ),
-    "demand_action_name": (
+    "demand_action_name": Parameter(
         DEFAULT_DEMAND_ACTION_NAME,
         "Name of the action Demand, for rules that send it.",
-        None,
+        read=ros_name,
     ),
-    "bookkeeping_topic": (
+    "bookkeeping_topic": Parameter(
         "/demandops/bookkeeping",
         "Topic of the bookkeeping that the detector reads at its start. Without a topic, the "
         "detector does not read the bookkeeping.",
-        None,
+        read=ros_name_or_none,
     ),
-    "settling_time": (
+    "settling_time": Parameter(
         10.0,
         "After the start or a change of the rules, an entity of a booked demand counts as gone if "
         "it stays unseen for this many seconds, or for the timeout of its source if that is "
         "longer.",
-        (0.1, 3_600.0),
+        span=(0.1, 3_600.0),
     ),
-    "period": (0.1, "Seconds between two evaluations of received messages.", (0.01, 10.0)),
-    "answer_timeout": (60.0, "How many seconds a goal may wait for its answer.", (1.0, 86_400.0)),
-    "log_level": (
-        "info",
-        "Lowest level of messages in the log: debug, info, warn, error or fatal.",
-        None,
+    "period": Parameter(
+        0.1, "Seconds between two evaluations of received messages.", span=(0.01, 10.0)
     ),
+    "answer_timeout": Parameter(
+        60.0, "How many seconds a goal may wait for its answer.", span=(1.0, 86_400.0)
+    ),
+    "log_level": LOG_LEVEL,
 }
-
-
-def _declared(node: Node, rules: str | None) -> dict[str, Any]:
-    values = {}
-    for name, (default, description, span) in PARAMETERS.items():
-        described = ParameterDescriptor(description=description, read_only=True)
-        if span is not None:
-            described.floating_point_range = [
-                FloatingPointRange(from_value=span[0], to_value=span[1])
-            ]
-        given = rules if name == "rules" and rules else default
-        try:
-            values[name] = node.declare_parameter(name, given, described).value
-        except ParameterException as error:
-            raise click.UsageError(str(error)) from None
-    if not values["rules"]:
-        raise click.UsageError("no rules given; name a file, or set the ROS parameter 'rules'")
-    if values["log_level"] not in LOG_LEVELS:
-        raise click.UsageError(
-            f"parameter log_level is '{values['log_level']}'; it takes {', '.join(LOG_LEVELS)}"
-        )
-    return values
 
 
 # ---- subscriptions to the topics that match the sources of rules ----
@@ -296,7 +278,10 @@ def read_bookkeeping(text: str, file: RuleFile) -> Mapping[str, Any] | None:
 class DetectorNode(Node):  # type: ignore[misc]
     def __init__(self, rules: str | None) -> None:
         super().__init__("demandops_detector")
-        settings = _declared(self, rules)
+        settings = read_parameters("demandops_detector", PARAMETERS, {"rules": rules})
+        if not settings["rules"]:
+            raise click.UsageError("no rules given; name a file, or set the ROS parameter 'rules'")
+        declare(self, PARAMETERS, settings)
         ros_process.log_to(self.get_logger(), settings["log_level"])
         self._rules, self._settle_s = settings["rules"], float(settings["settling_time"])
         self._path = Path(self._rules)
@@ -398,32 +383,23 @@ class DetectorNode(Node):  # type: ignore[misc]
 
     def _reload_if_changed(self) -> None:
         # while the file is invalid, the last valid rules stay in effect
+        text = ""
         try:
             _, text = read_input(self._path)
-        except InvalidInput as error:
-            self._text = ""  # any content that is read next counts as changed
-            self._keep_rules(error)
-            return
-        if text == self._text or not self._is_started:
-            return
-        self._text = text
-        try:
+            if text == self._text or not self._is_started:
+                return
             file, _ = _read_rules(self._path)
         except InvalidInput as error:
-            self._keep_rules(error)
+            problems = tuple(map(str, error.faults))
+            for problem in problems if problems != self._problems else ():
+                log.warning("%s; the last valid rules stay in effect", one_line(problem))
+            self._text, self._problems = text, problems
             return
-        self._problems = ()
+        self._text, self._problems = text, ()
         self._sender.want(self._detector.replace_rules(file, self._now(), self._settle_s))
         self._topics.close()
         self._topics = self._subscribe(file)
         log.info("the file has changed; rules: %d", len(file.rules))
-
-    def _keep_rules(self, error: InvalidInput) -> None:
-        problems = tuple(map(str, error.faults))
-        if problems != self._problems:
-            for problem in problems:
-                log.warning("%s; the last valid rules stay in effect", one_line(problem))
-        self._problems = problems
 
     def _report(self) -> None:
         detector, add = self._detector, self._diagnostics.add

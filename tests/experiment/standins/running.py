@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any
 
 import rclpy
-from demandops_ros.ros_process import ExecutorThread, stop_signals
+from demandops_ros.ros_process import ExecutorThread, StopSignals
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
@@ -23,8 +23,8 @@ def start(args: list[str] | None = None, domain: int | None = None) -> None:
 
 def spin(node: Node) -> None:
     """Run a node's callbacks until Ctrl-C or SIGTERM, then shut ROS down."""
-    with stop_signals() as wait_for_signal:
+    with StopSignals() as signals:
         thread = ExecutorThread(node)
-        wait_for_signal()
+        signals.wait()
         thread.close()
     rclpy.try_shutdown()

@@ -128,7 +128,7 @@ def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
     with ExitStack() as full:
 
         def fill_disk(done: object) -> None:
-            full.enter_context(files_end_at(generator._slot.journal._size))
+            full.enter_context(files_end_at(generator._journal._size))
 
         with rig.busy(generator, goal(0)) as waiting:
             refused = generator.submit({}, "op-1")

@@ -10,9 +10,12 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from demandops.base import settings
+from demandops.cli import state_repo
 from demandops.model.demand import goals as demand_goals
-from demandops.repo.write.journal import DamagedJournal
+from demandops.serve.demands import GIVEN_UP
 from demandops.serve.generator import Generator
+from demandops.serve.journal import DamagedJournal
 
 from tests.kit import rig
 from tests.kit.cli import Run
@@ -319,6 +322,72 @@ def test_the_accepted_demands_are_listed(url: str, bare: Path, demandops: Run) -
     assert demandops("journal", "--state-repo", url).out == (
         "0 demands are accepted and not published\n"
     )
+
+
+def test_a_goal_that_this_version_cannot_read_is_refused_and_stops_no_start(
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    left = [
+        rig.journaled(f"op-{number}", made, "2026-03-01T00:00:00+00:00", rig.tip(bare))
+        for number, made in enumerate([{"colour": "red"}, goal(1)])
+    ]
+    rig.leave_in_journal(settings.data_home(url), *left)
+    assert rig.restart(url)
+    assert re.search(
+        r"demand op-0 .* from the journal: refused: .* colour: is not a field", caplog.text
+    )
+    assert rig.operations(bare) == ["op-1"]
+
+
+def test_a_demand_that_is_dropped_is_not_carried_out_at_the_next_start(
+    url: str, bare: Path, data_home: Path, demandops: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    _leave_pending(url, bare, [1, 2])
+    command = ("journal", "--state-repo", url, "--drop")
+    assert demandops(*command, "op-1").out.startswith("demand op-1 is given up; ")
+    _leave_pending(url, bare, [3])
+    journal = next(data_home.glob("*/slot-0/outbox.jsonl"))
+    slot = journal.parent.with_name("slot-7")  # of a process that died before it gave op-3 up
+    slot.mkdir()
+    journal.rename(slot / journal.name)
+    (slot / "drop-op-3").touch()
+    assert demandops(*command, "op-1").err == (
+        "error: no journal on this machine has a demand with the operation id 'op-1'; "
+        "`demandops journal` lists those that it has\n"
+    )
+    assert rig.restart(url)
+    assert rig.operations(bare) == ["op-2"]
+
+
+def test_a_running_generator_answers_a_demand_that_is_dropped(
+    url: str,
+    bare: Path,
+    demandops: Run,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    caplog.set_level("INFO", logger="demandops")
+    command = ("journal", "--state-repo", url, "--output", "json", "--drop")
+    with rig.running(url) as generator:
+        with rig.away(bare):
+            pushed = generator.submit(goal(1), "op-1")
+            rig.wait_until(lambda: "trying again" in caplog.text, "the push fails")
+            queued = generator.submit(goal(2), "op-2")
+            rig.wait_until_queued([queued])
+            assert demandops(*command, "op-2").json() == {
+                "operation_id": "op-2",
+                "outcome": "answered",
+            }
+            assert str(queued.future.exception(rig.PATIENCE_S)) == GIVEN_UP
+            # its push may have arrived, so it waits for the state repo
+            monkeypatch.setattr(state_repo, "_DROP_S", 0.0)
+            assert demandops(*command, "op-1").json()["outcome"] == "requested"
+            rig.wait_until(lambda: f"{GIVEN_UP}: demand op-1" in caplog.text, "it is told")
+            assert not pushed.future.done()
+        assert str(pushed.future.exception(rig.PATIENCE_S)) == GIVEN_UP
+        rig.receipt(generator.submit(goal(3), "op-3"))
+    assert rig.operations(bare) == ["op-3"]
+    assert demandops("journal", "--state-repo", url).out.startswith("0 demands")
 
 
 def test_two_processes_have_slots_of_their_own_and_a_dead_ones_journal_is_adopted(

@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 from demandops.base import settings
 from demandops.model.ledger.claim import Claim
-from demandops.repo.write.journal import Slot
 from demandops.serve.agenda import LIMIT_LOCAL
 from demandops.serve.generator import Generator
 
@@ -99,12 +98,15 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
         rig.book(generator, put("d", 60))
     # by the record, the lease ended 40 s ago; the renewal came before, while no generator ran
     received = (clock.now() + timedelta(seconds=50)).isoformat()
-    slot = Slot(settings.data_home(str(bare)))
     # so many others before it that it is not in the first batch
     others = {f"op-{number}": renew("nothing") for number in range(LIMIT_LOCAL)}
-    for operation, goal in (others | {"op-renew": renew("d")}).items():
-        slot.journal.append([rig.journaled(operation, goal, received, rig.tip(bare))])
-    slot.close()
+    rig.leave_in_journal(
+        settings.data_home(str(bare)),
+        *(
+            rig.journaled(operation, goal, received, rig.tip(bare))
+            for operation, goal in (others | {"op-renew": renew("d")}).items()
+        ),
+    )
     clock.pass_(100)
     with rig.running(bare, runtime=clock) as generator:
         rig.wait_until(lambda: "op-renew" in rig.operations(bare), "the renewal is taken up")

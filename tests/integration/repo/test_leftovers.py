@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from demandops.base.errors import StateRepoError, Unsound
 from demandops.repo.git.local_repository import LocalRepository
-from demandops.repo.write.journal import Journal
+from demandops.serve.journal import Journal
 
 from tests.kit import rig
 from tests.kit.repo import git, tip

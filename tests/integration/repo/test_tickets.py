@@ -16,8 +16,8 @@ from demandops.base.errors import (
     Unsound,
 )
 from demandops.base.runtime import Runtime
-from demandops.serve.demands import Ticket
 from demandops.serve.generator import Generator
+from demandops.serve.journal import Ticket
 
 from tests.kit import rig
 from tests.kit.clock import Clock
@@ -272,7 +272,7 @@ def test_an_operation_id_of_a_demand_that_has_no_answer_yet_is_refused(
 def test_a_bug_in_the_journal_leaves_no_demand_without_an_answer(
     generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Ticket, "record", lambda ticket: {"goal": object()})
+    monkeypatch.setattr(Ticket, "as_data", lambda ticket: {"goal": object()})
     for ticket in [generator.submit(goal(number)) for number in (1, 2)]:
         assert "internal error" in str(ticket.future.exception(rig.PATIENCE_S))
     monkeypatch.undo()
@@ -307,7 +307,7 @@ def test_nobody_is_answered_after_a_journal_may_hold_what_it_refused(bare: Path)
     ended = threading.Event()
     runtime.when_unsound = ended.set
     with rig.running(bare, runtime=runtime) as generator:
-        journal = generator._slot.journal
+        journal = generator._journal
         file, journal._file = journal._file, Path("/dev/full").open("ab", buffering=0)  # noqa: SIM115
         assert rig.outcome(generator.submit(goal(1))) == "Unsound"
         assert ended.wait(rig.PATIENCE_S)

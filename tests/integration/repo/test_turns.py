@@ -6,7 +6,6 @@ import shutil
 import threading
 from pathlib import Path
 
-from demandops.repo.write.journal import Slot
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -39,12 +38,14 @@ def test_resumed_demands_are_answered_in_the_order_of_their_commits(
     with rig.running(bare) as generator:
         rig.receipt(generator.submit(rig.goal(2), "op-2"))
     # a journal as if the process had died before op-2's answer and op-1's publication
-    slot, turns, answered = Slot(tmp_path), Turns(1), []
-    slot.journal.append(
-        rig.journaled(f"op-{number}", rig.goal(number), turns.now().isoformat(), base)
-        for number in (1, 2)
+    turns, answered = Turns(1), []
+    rig.leave_in_journal(
+        tmp_path,
+        *(
+            rig.journaled(f"op-{number}", rig.goal(number), turns.now().isoformat(), base)
+            for number in (1, 2)
+        ),
     )
-    slot.close()
     generator = Generator(str(bare), data=tmp_path, runtime=turns)
     for operation, ticket in generator._demands._tickets.items():
         ticket.future.add_done_callback(lambda _, operation=operation: answered.append(operation))

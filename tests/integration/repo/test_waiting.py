@@ -6,8 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from demandops.repo.write.commit_batch import CommitBatch
-from demandops.repo.write.journal import Slot
-from demandops.serve.agenda import WaitingTurns
+from demandops.serve.agenda import Agenda
 from demandops.serve.generator import Generator
 from demandops.templating.evaluator import processor_time
 
@@ -61,10 +60,8 @@ def test_a_waiting_demand_whose_answer_was_lost_is_answered_again(
     outcomes = [ticket.future.result().outcome for ticket in tickets]
     assert outcomes == ["booked", *["waiting"] * 3]
 
-    slot = Slot(tmp_path / "second")
     received = tickets[2].received.isoformat()
-    slot.journal.append([rig.journaled("op-2", goals[2], received, base)])
-    slot.close()
+    rig.leave_in_journal(tmp_path / "second", rig.journaled("op-2", goals[2], received, base))
     again = Generator(str(bare), data=tmp_path / "second", runtime=turns)
     resumed = again._demands._tickets["op-2"].future
     turns.wait(again.stop().done)
@@ -99,9 +96,9 @@ def test_a_round_ends_with_a_demand_whose_template_takes_too_long(
         template = file_of(bare, TEMPLATE)
         person.change({NODES: nodes, TEMPLATE: ENDLESS + template}, "Room, and no end")
         rig.book(generator, link(1))
-        turns = WaitingTurns(generator._repository.runtime)
+        turns = Agenda(0, generator._repository.runtime)
         with processor_time(0.1):
-            turns.book_due(CommitBatch(generator._repository, generator.snapshot))
+            turns.book_waiting(CommitBatch(generator._repository, generator.snapshot))
         assert turns.left
         person.change({TEMPLATE: template}, "An end")
         rig.book(generator, link(2))

@@ -17,12 +17,11 @@ from demandops.model.demand.demand import Application, Demand, Item, Lease
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
 from demandops.serve.agenda import (
-    FIRST_PAUSE_S,
+    FIRST_TURN_S,
     LONGEST_AWAY_S,
     LONGEST_TURN_S,
     Agenda,
     Backoff,
-    LeaseExpiry,
     RateLimit,
     parse_interval,
 )
@@ -48,11 +47,11 @@ def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew()
     for _ in range(10):
         pace.unreachable()
     pace.overtaken(10, 0.1, 1.0)
-    assert pace.unreachable() <= FIRST_PAUSE_S
+    assert pace.unreachable() <= FIRST_TURN_S
     for _ in range(10):
         pace.overtaken(10, 0.1, 1.0)
     pace.begin_anew()
-    assert pace.overtaken(10, 0.1, 1.0) <= FIRST_PAUSE_S
+    assert pace.overtaken(10, 0.1, 1.0) <= FIRST_TURN_S
 
 
 def test_a_batch_takes_no_more_demands_than_are_evaluated_during_one_push() -> None:
@@ -74,7 +73,7 @@ def clock() -> Clock:
 
 
 def fetch_in(agenda: Agenda) -> float:
-    return agenda.seconds_until_due(EMPTY, "")["fetch"]
+    return agenda.due_in(EMPTY, "")["fetch"]
 
 
 def test_the_first_look_is_due_at_once_and_the_next_after_the_interval(clock: Clock) -> None:
@@ -89,7 +88,7 @@ def test_the_first_look_is_due_at_once_and_the_next_after_the_interval(clock: Cl
 @pytest.mark.parametrize(
     ("interval", "is_local", "reached", "pauses"),
     [
-        (10, False, [False] * 5 + [True], [20, 40, 60, 60, 60, 10]),
+        (10, False, [False] * 5 + [True], [10, 20, 40, 60, 60, 10]),
         (600, False, [False, True], [600, 600]),  # above the bound
         (30, True, [True], [1]),  # on this disk a look costs little
         (0, True, [True], [inf]),
@@ -121,6 +120,17 @@ def test_many_requests_give_one_poll_and_one_more_after_it(clock: Clock) -> None
     made.fetch_begins()
     made.fetched(reached=True)
     assert fetch_in(made) == inf
+
+
+def test_what_failed_waits_twice_as_long_each_time_up_to_a_minute(clock: Clock) -> None:
+    made = Agenda(0, clock)
+    for pause in (10, 20, 40, 60, 60):
+        assert made.failed("drain", "edge", first=10) == made.waits_s("drain", "edge") == pause
+        assert made.waits_s("drain", "cloud") == 0
+        clock.pass_(pause)
+        assert made.waits_s("drain", "edge") == 0
+    clock.pass_(60)
+    assert made.failed("drain", "edge", first=10) == 10, "it has not failed for a minute"
 
 
 def test_by_chance_looks_come_earlier_and_never_later() -> None:
@@ -222,17 +232,21 @@ def leased(*terms: tuple[str, int, int]) -> Ledger:
 
 
 @pytest.fixture
-def expiry(clock: Clock) -> LeaseExpiry:
-    return LeaseExpiry(clock)
+def expiry(clock: Clock) -> Agenda:
+    return Agenda(0, clock)
 
 
-def ended(expiry: LeaseExpiry, ledger: Ledger) -> list[str]:
+def leases_in(expiry: Agenda, ledger: Ledger) -> float:
+    return expiry.due_in(replace(EMPTY, ledger=ledger), "")["leases"]
+
+
+def ended(expiry: Agenda, ledger: Ledger) -> list[str]:
     return [claim.demand for claim in expiry.ended_claims(ledger)[1]]
 
 
 @pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
 def test_it_is_set_forward_and_a_full_term_is_granted(
-    clock: Clock, expiry: LeaseExpiry, steps: list[int], caplog: pytest.LogCaptureFixture
+    clock: Clock, expiry: Agenda, steps: list[int], caplog: pytest.LogCaptureFixture
 ) -> None:
     ledger = leased(("short", 60, 5), ("long", 600, 5))
     for step in steps:
@@ -244,7 +258,7 @@ def test_it_is_set_forward_and_a_full_term_is_granted(
         assert ended(expiry, ledger) == over
 
 
-def test_the_claims_of_a_demand_end_together(clock: Clock, expiry: LeaseExpiry) -> None:
+def test_the_claims_of_a_demand_end_together(clock: Clock, expiry: Agenda) -> None:
     ledger = leased(("d", 60, 0), ("d", 600, 0))
     clock.set_by(3600)
     for seconds, over in ((0, []), (61, []), (540, ["d", "d"])):
@@ -252,7 +266,7 @@ def test_the_claims_of_a_demand_end_together(clock: Clock, expiry: LeaseExpiry) 
         assert ended(expiry, ledger) == over
 
 
-def test_a_step_that_nobody_looked_at_is_noticed_later(clock: Clock, expiry: LeaseExpiry) -> None:
+def test_a_step_that_nobody_looked_at_is_noticed_later(clock: Clock, expiry: Agenda) -> None:
     ledger = leased(("a", 60, 0))
     clock.pass_(50)
     clock.set_by(3600)
@@ -263,33 +277,33 @@ def test_a_step_that_nobody_looked_at_is_noticed_later(clock: Clock, expiry: Lea
 
 
 def test_small_adjustments_of_the_clock_count_as_no_step(
-    clock: Clock, expiry: LeaseExpiry, caplog: pytest.LogCaptureFixture
+    clock: Clock, expiry: Agenda, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.WARNING)
-    ledger = leased(("a", 30, 30))
-    for _ in range(31):
+    ledger = leased(("a", 60, 60))
+    for _ in range(61):
         clock.pass_(1)
         clock.set_by(1)
-        expiry.seconds_until_due(ledger, 60.0)
+        leases_in(expiry, ledger)
     assert ended(expiry, ledger) == ["a"]
     assert caplog.text == ""
 
 
-def test_it_looks_again_when_the_first_lease_ends(clock: Clock, expiry: LeaseExpiry) -> None:
+def test_it_looks_again_when_the_first_lease_ends(clock: Clock, expiry: Agenda) -> None:
     ledger = leased(("a", 20, 10), ("b", 600, 0))
-    assert expiry.seconds_until_due(ledger, 60.0) == pytest.approx(30.01)
+    assert leases_in(expiry, ledger) == pytest.approx(30.01)
     clock.pass_(29.5)
-    assert expiry.seconds_until_due(ledger, 60.0) == 1.0
+    assert leases_in(expiry, ledger) == 1.0
     clock.pass_(100)
-    assert expiry.seconds_until_due(ledger, 60.0) == 1.0, "it must not keep the clock busy"
-    assert expiry.seconds_until_due(Ledger(), 60.0) == 60.0
-    assert expiry.seconds_until_due(leased(("b", 86_400, 0)), 60.0) == 60.0
+    assert leases_in(expiry, ledger) == 1.0, "it must not keep the clock busy"
+    assert leases_in(expiry, Ledger()) == 60.0
+    assert leases_in(expiry, leased(("b", 86_400, 0))) == 60.0
 
 
-def test_an_end_that_moves_within_its_minute_is_seen(expiry: LeaseExpiry) -> None:
+def test_an_end_that_moves_within_its_minute_is_seen(expiry: Agenda) -> None:
     ledger = leased(("a", 50, 0), ("b", 55, 0))
-    assert expiry.seconds_until_due(ledger, 60) == pytest.approx(50, abs=0.1)
+    assert leases_in(expiry, ledger) == pytest.approx(50, abs=0.1)
     (claim,) = ledger.claims_of_demand("b")
     sooner = replace(claim, lease=Lease(20, 0, NOW + timedelta(seconds=20)))
     ledger = ledger.replace(claim.key, sooner)
-    assert expiry.seconds_until_due(ledger, 60) == pytest.approx(20, abs=0.1)
+    assert leases_in(expiry, ledger) == pytest.approx(20, abs=0.1)

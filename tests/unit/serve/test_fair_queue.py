@@ -10,8 +10,8 @@ import pytest
 from demandops.base.errors import QueueFull
 from demandops.base.runtime import REAL
 from demandops.model.demand import goals
-from demandops.repo.write.journal import Journal
-from demandops.serve.demands import Demands, FairQueue, Ticket
+from demandops.serve.demands import Demands, FairQueue
+from demandops.serve.journal import Journal, Ticket
 
 from tests.kit.memory import NOW
 

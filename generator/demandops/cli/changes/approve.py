@@ -12,7 +12,7 @@ from demandops.base.runtime import REAL
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import warned_if_unnamed
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import errors
+from demandops.cli.output import done, errors
 from demandops.cli.queries.diff import differences, entry_lines, release_lines
 from demandops.cli.target import names_of, signing_option, writable_repo_option
 from demandops.repo.reader import Reader
@@ -117,6 +117,7 @@ def approve(
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
         details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
         merged = person_commit.merge(repo.repository, proposal, details)
+        done.append(f"{proposal.branch} is merged in {merged.commit}")
     data = {"outcome": "approved", "branch": proposal.branch, "commit": merged.commit}
     show(output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"])
 
@@ -145,5 +146,6 @@ def reject(name: str, commit: str, yes: bool, state_repo: str, output: str) -> N
         proposal = _proposal(repo, name, commit, output)
         person_change.confirm("Turn it down?", yes, output)
         ProposalBranches(repo.repository).remove(proposal.branch, proposal.commit)
+        done.append(f"{proposal.branch} is deleted")
     data = {"outcome": "rejected", "branch": proposal.branch, "commit": proposal.commit}
     show(output, data, [f"turned down: {proposal.branch} is deleted"])

@@ -15,7 +15,7 @@ from demandops.base.errors import Fault, InvalidInput, Refused
 from demandops.base.runtime import REAL
 from demandops.cli.changes import person_change
 from demandops.cli.json_output import Json, claim_data, faults_of, output_option, show
-from demandops.cli.output import busy, console, errors, progress
+from demandops.cli.output import busy, console, done, errors, progress
 from demandops.cli.queries.diff import release_lines
 from demandops.cli.target import dry_run_option, names_of, signing_option, writable_repo_option
 from demandops.decide.changeset import ReleaseChange
@@ -28,8 +28,8 @@ from demandops.repo import reader
 from demandops.repo.history import commit_log
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
-from demandops.serve.demands import Receipt
 from demandops.serve.generator import Generator
+from demandops.serve.journal import Receipt
 
 # ---- booking, and printing the changes ----
 
@@ -48,7 +48,9 @@ def booked(generator: Generator, demand: Demand) -> Receipt:
     ticket = generator.submit(demand)
     with busy("booking"):
         await_answer(ticket.future)
-    return ticket.future.result()
+    receipt = ticket.future.result()
+    done.append(f"{receipt.outcome} in {receipt.commit}")
+    return receipt
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import json_output, target
 from demandops.cli.json_output import Json
-from demandops.cli.output import errors, progress
+from demandops.cli.output import done, errors, progress
 from demandops.model.config.base_model import parse_file
 from demandops.model.config.override import Override, OverrideFile
 from demandops.model.ledger.ledger import World
@@ -144,13 +144,16 @@ def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
         warned_if_unnamed(repo.operator()), REAL.now(), edit.summary, one_line(edit.reason)
     )
     if not propose:
-        return person_commit.commit_to_main(repo.repository, files, details)
+        committed = person_commit.commit_to_main(repo.repository, files, details)
+        done.append(f"commit {committed.commit} on {MAIN_BRANCH}")
+        return committed
     branch = f"override/{edit.name}"
     title, reason = harmless(one_line(edit.summary)), one_line(edit.reason)
     proposals = repo.snapshot().state.config.repo_settings.proposals
     # only GitLab opens a merge request for a push
     push_options = merge_request(title, reason) if proposals.forge == "gitlab" else []
     pushed = person_commit.commit_to_branch(repo.repository, files, details, branch, push_options)
+    done.append(f"commit {pushed.commit} on {branch}")
     link = pushed.link
     try:
         if not link and (forge := forge_for(proposals, settings.forge_token_file())):

@@ -24,14 +24,14 @@ from demandops.base.strict_yaml import read_input
 from demandops.cli.changes import ledger_change
 from demandops.cli.changes.ledger_change import started_generator
 from demandops.cli.json_output import Json, faults_of, output_option, print_json
-from demandops.cli.output import console, errors, progress
+from demandops.cli.output import console, done, errors, progress
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
 from demandops.decide.decision import decide
 from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
 from demandops.serve.approvals.proposal import parse_waiting_text
-from demandops.serve.demands import Receipt
 from demandops.serve.generator import Generator
+from demandops.serve.journal import Receipt
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,9 +206,9 @@ def _book(
             has_started = True
             for document in documents:
                 answers.append(_Answer().of(generator, document, wait))
-            for done, answer in enumerate(answers, start=1):
+            for number, answer in enumerate(answers, start=1):
                 ledger_change.await_answer(answer)
-                report(done, len(documents))
+                report(number, len(documents))
     except KeyboardInterrupt:
         if not has_started:
             raise
@@ -219,7 +219,13 @@ def _book(
         unsent.set_exception(Withdrawn("was not sent, because of the interrupt; send it again"))
         answers.append(unsent)
     pairs = enumerate(zip(documents, answers, strict=True))
-    return [answer.row(index, document) for index, (document, answer) in pairs]
+    rows = [answer.row(index, document) for index, (document, answer) in pairs]
+    done.extend(
+        f"request '{one_line(row['request'])}' {row['outcome']} in {row['commit']}"
+        for row in rows
+        if row["commit"]
+    )
+    return rows
 
 
 def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Json]:

@@ -13,7 +13,7 @@ import click
 from demandops.base import settings, strict_yaml
 from demandops.base.errors import InvalidInput, fault, suggestion
 from demandops.base.naming import SubjectKind
-from demandops.base.quoting import json_escaped, quoted
+from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import json_output
@@ -557,7 +557,7 @@ def _print_list(kind: str, source: Source, items: list[Json], output: str, watch
     commit = str(source.snapshot.commit)
     plain = json.loads(json.dumps({"kind": kind, "commit": commit, "items": items}))
     if output == "json" and watch:
-        click.echo(json_escaped(json.dumps(plain, ensure_ascii=False)))
+        click.echo(json_output.json_text(plain))
     elif output == "json":
         json_output.print_json(plain)
     elif output == "yaml":

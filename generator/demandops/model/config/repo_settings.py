@@ -130,3 +130,6 @@ class RepoSettings(FileModel):
     proposals: Proposals = Proposals()
     limits: Limits = Limits()
     placement: Literal["nearest", "spread", "pack"] = "nearest"
+    signed_off_by: (
+        Annotated[str, StringConstraints(pattern=r"^[^<>\s][^<>\n]* <[^<>\s]+@[^<>\s]+>$")] | None
+    ) = None

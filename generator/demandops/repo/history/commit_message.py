@@ -139,6 +139,12 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
     return signature(f"{names} ({who})", f"{local}@requester.demandops.invalid", received)
 
 
+def signed_off(text: str, by: str) -> str:
+    # in the last paragraph if it has trailers, as `git commit --signoff`
+    gap = "" if parse(text).trailers else "\n"
+    return f"{text.rstrip()}\n{gap}Signed-off-by: {one_line(by)}\n"
+
+
 def of_decision(
     decision: Decision, operation: str, received: datetime, more: Iterable[tuple[str, str]] = ()
 ) -> str:

@@ -83,6 +83,8 @@ class CommitBatch:
         now: datetime,
     ) -> str:
         committer = commit_message.generator_signature(now)
+        if signed_off_by := state.config.repo_settings.signed_off_by:
+            text = commit_message.signed_off(text, signed_off_by)
         for attempt in range(1, _ATTEMPTS + 1):
             try:
                 new = self._repository.new

@@ -6,6 +6,7 @@ The person is author and committer, so a generator reads the commit like any oth
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -155,7 +156,11 @@ def _commit(
         _require_valid(repository, tip)
         snapshots.config_at(repository.objects[tree].peel(Tree))
     who = commit_message.signature(*details.person, details.now)
-    return repository.new.add_commit(repository.signer, (who, who), details.text, tree, parents)
+    text = details.text
+    with suppress(InvalidInput):
+        if snapshots.config_at(tip.tree).repo_settings.signed_off_by:
+            text = commit_message.signed_off(text, f"{who.name} <{who.email}>")
+    return repository.new.add_commit(repository.signer, (who, who), text, tree, parents)
 
 
 def _require_valid(repository: StateRepository, tip: Commit) -> None:

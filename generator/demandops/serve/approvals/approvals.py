@@ -33,7 +33,6 @@ from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
-from demandops.repo.write.journal import ProposalRecord
 from demandops.repo.write.proposal_branch import (
     BranchHeads,
     BranchMoved,
@@ -54,7 +53,8 @@ from demandops.serve.approvals.proposal import (
     releases,
     waiting_text,
 )
-from demandops.serve.demands import TAKEN_BACK, Demands, Receipt, Ticket
+from demandops.serve.demands import TAKEN_BACK, Demands
+from demandops.serve.journal import ProposalRecord, Receipt, Ticket
 
 log = logging.getLogger("demandops")
 

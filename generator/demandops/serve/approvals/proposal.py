@@ -24,8 +24,7 @@ from demandops.model.demand.demand import Demand
 from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.forge import PullRequest
 from demandops.repo.history import commit_message
-from demandops.repo.write.journal import ProposalRecord
-from demandops.serve.demands import Ticket
+from demandops.serve.journal import ProposalRecord, Ticket
 
 Decided: TypeAlias = list[tuple[Ticket, Decision]]
 Failed: TypeAlias = list[tuple[Ticket, DemandOpsError]]

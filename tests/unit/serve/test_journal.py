@@ -7,33 +7,43 @@ import os
 import stat
 import subprocess
 import sys
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 from demandops.base.errors import StateRepoError
-from demandops.repo.write.journal import (
+from demandops.repo.slot import Slot
+from demandops.serve.journal import (
     DamagedJournal,
     Journal,
     ProposalRecord,
-    Record,
-    Slot,
+    Ticket,
     parse,
     read,
 )
 
+from tests.kit.generator import journaled
 from tests.kit.goals import perception
 from tests.kit.limits import files_end_at
 
 PROPOSAL = ProposalRecord("demand/x", ("a",))
 
 
-def entry(name: str, goal: object = "wish") -> Record:
+def entry(name: str, goal: object = "wish", proposal: ProposalRecord | None = None) -> Ticket:
     received = "2026-01-31T12:00:00+00:00"
-    return {"operation": f"op-{name}", "goal": {"id": goal}, "received": received, "base": "bbbb"}
+    ticket = journaled(f"op-{name}", {"id": goal}, received, "bbbb")
+    ticket.proposal = proposal
+    return ticket
 
 
-def pending(text: bytes) -> dict[str, Record]:
-    return parse(text, Path("outbox.jsonl"))
+def data_of(tickets: Mapping[str, Ticket]) -> dict[str, Any]:
+    return {operation: ticket.as_data() for operation, ticket in tickets.items()}
+
+
+def pending(text: bytes) -> dict[str, Any]:
+    return data_of(parse(text, Path("outbox.jsonl")))
 
 
 @pytest.fixture
@@ -48,16 +58,16 @@ def text(path: Path) -> bytes:
     journal.append([entry("a"), entry("b")])
     journal.append([entry("c")])
     journal.mark_done(["op-b"])
-    journal.append([entry("c") | {"proposal": PROPOSAL}])
+    journal.append([entry("c", proposal=PROPOSAL)])
     return path.read_bytes()
 
 
 def test_the_journal_reads_back_the_entries_that_are_not_done(path: Path, text: bytes) -> None:
     found = pending(text)
     assert list(found) == ["op-a", "op-c"]
-    assert found["op-a"] == entry("a")
-    assert found["op-c"]["proposal"] == PROPOSAL
-    assert Journal(path).pending == found
+    assert found["op-a"] == entry("a").as_data()
+    assert found["op-c"]["proposal"] == asdict(PROPOSAL)
+    assert data_of(Journal(path).pending) == found
     assert len(path.read_bytes().splitlines()) == 2, (
         "a start must leave out the demands that are done"
     )
@@ -129,7 +139,7 @@ def test_the_file_stays_small_however_many_demands_pass(path: Path, waiting: int
     for number in range(100):
         batch = [entry(f"{number}-{each}", "x" * 100) for each in range(100)]
         journal.append(batch)
-        journal.mark_done(each["operation"] for each in batch)
+        journal.mark_done(each.operation for each in batch)
         largest = max(largest, path.stat().st_size)
     written = 10_000 * 300
     assert largest < (1 << 20) + 3 * waiting * 250 + 100 * 400 < written
@@ -200,9 +210,9 @@ def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:
     path.write_bytes(of_the_first_version(WAITING, PROPOSED, *done) + b'{"operation": "op-4"')
     found = read(path)
     assert list(found) == ["op-1", "op-2"]
-    assert Journal(path).pending == found
+    assert data_of(Journal(path).pending) == data_of(found)
     assert path.read_bytes().count(b'"digest"') == 2
-    assert read(path) == found
+    assert data_of(read(path)) == data_of(found)
 
 
 @pytest.mark.parametrize(
