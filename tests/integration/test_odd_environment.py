@@ -60,9 +60,9 @@ ODD = {
         "error: the current folder no longer exists; change to one that does",
     ),
     "few open files": (
-        "ulimit -n 5; exec $D get nodes",
+        "ulimit -n 7; exec $D get nodes",
         1,
-        "error: get does not start: .*Too many open files",
+        r"error: (get does not start: |.*)Too many open files.*",
     ),
 }
 

@@ -60,8 +60,11 @@ def test_who_breaks_a_rule_of_the_server_is_told_and_the_others_are_booked(
 
 
 def test_a_demand_that_is_too_large_for_the_server_holds_up_nobody(
-    http: str, server: Server, bare: Path
+    http: str, server: Server, bare: Path, person: Person
 ) -> None:
+    settings = person.read("demandops.yaml")
+    patient = f"{settings}\nlimits: {{decisionMilliseconds: 1000000}}\n"  # on a slow machine too
+    person.change({"demandops.yaml": patient})
     server.faults.largest_push = 30_000
     large = goals.put("large", "vehicle01", topic=("/a", "vehicle01"))
     large["applications"][0]["inputs"]["ego_data"] = [
