@@ -59,11 +59,6 @@ ODD = {
         1,
         "error: the current folder no longer exists; change to one that does",
     ),
-    "few open files": (
-        "ulimit -n 7; exec $D get nodes",
-        1,
-        r"error: (get does not start: |.*)Too many open files.*",
-    ),
 }
 
 
