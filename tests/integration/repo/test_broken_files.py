@@ -114,6 +114,29 @@ def test_a_merge_of_any_style_is_judged_and_so_is_a_second_one_of_the_same_branc
     assert differing(bare) == {}
 
 
+def test_a_pull_that_makes_main_the_second_parent_stops_no_demand(
+    bare: Path, person: Person
+) -> None:
+    """No trailer shows that what was merged before was in effect, so what was before it is."""
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        person.write({"overrides/broken.yaml": BROKEN})
+        for command in ("add .", "commit -q -m Mine"):
+            rig.git(person.folder, *command.split())
+        node = {"id": "one", "type": "vehicle", "cluster": "c-its"}
+        nodes = {"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": [node]}
+        merged = person.change({"inventory/nodes/one.yaml": yaml.safe_dump(nodes)})
+        generator.fetch_now()
+        rig.wait_until(lambda: includes(generator, merged), "it is followed")
+        rig.git(person.folder, "pull", "-q", "--no-rebase", "--no-edit")
+        rig.git(person.folder, "push", "-q", "origin", "HEAD:main")
+        rig.book(generator, goal(2))
+        assert [one.file for one in generator.snapshot.problems] == ["overrides/broken.yaml"]
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(3))
+    assert differing(bare) == {}
+
+
 def includes(generator: Generator, commit: str) -> bool:
     return generator.includes(str(generator.snapshot.commit), commit)
 

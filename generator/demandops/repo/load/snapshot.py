@@ -73,9 +73,12 @@ class Snapshot:
 
     @property
     def is_settled(self) -> bool:
-        """Whether nothing is left to judge, to render or to put back."""
-        is_judged = bool(self.faults) or self.told is None
-        return self.is_rendered and not self.put_back and is_judged
+        """Whether nothing is left to judge, to render, to put back or to tell."""
+        return self.is_rendered and not self.put_back and self.is_told
+
+    @property
+    def is_told(self) -> bool:
+        return self.told == (self.refused if self.faults else None)
 
     @property
     def problems(self) -> tuple[Fault, ...]:
@@ -174,7 +177,7 @@ def configuration_of(repo: Repository, commit: Commit, entry: LogEntry | None) -
     if not named:
         return commit.id
     found = trees.commit_of(repo, named).id
-    if _on_line(repo, commit.id, found) != found:
+    if not _was_main(repo, commit.id, found):
         raise StateRepoError(
             f"commit {commit.id} names {named} as its configuration, which is no commit before it; "
             "set the branch back to the commit before it"
@@ -182,28 +185,37 @@ def configuration_of(repo: Repository, commit: Commit, entry: LogEntry | None) -
     return found
 
 
-# By the commit of a configuration, the newest one along whose first parents it was found. Each commit
-# made while another is not valid would else be followed back to it.
-_on_line_of: dict[Oid, Oid] = {}
+# By the commit of a configuration, the newest generator's commit that is known to follow it.
+_followed_by: dict[Oid, Oid] = {}
 
 
-def _on_line(repo: Repository, to: Oid, configuration: Oid) -> Oid | None:
-    """Return ``configuration``, or if people have rewritten main, a commit with the same files.
+def _was_main(repo: Repository, to: Oid, configuration: Oid) -> bool:
+    """Return whether a commit was main before ``to``, because people merge what they looked at.
 
-    People merge only what they have looked at, so a commit counts if it was main once: it is along
-    the first parents, or a generator's.
+    It is along the first parents of ``to`` or of a generator's commit, or is a generator's.
     """
-    wanted, same = trees.commit_of(repo, configuration), None
-    ids = config_ids(wanted.tree)
-    for commit in commit_log.first_parents(repo, to):
-        if commit.id in (configuration, _on_line_of.get(configuration)):
-            _on_line_of[configuration] = to
-            return configuration
-        if same is None and config_ids(commit.tree) == ids:
-            same = commit.id
-    if repo.descendant_of(to, configuration) and commit_log.is_by_generator(repo, wanted):
-        return configuration
-    return same
+
+    if _follows(repo, to, _followed_by.get(configuration)):
+        return True
+    if not _follows(repo, to, configuration):
+        return False
+    main = {to}
+    for commit, entry in commit_log.commits(repo, to, configuration):
+        if commit.id in main or (entry.by_generator and commit_log.is_by_generator(repo, commit)):
+            main.update(commit.parent_ids[:1])
+    found = trees.commit_of(repo, configuration)
+    if configuration not in main and not commit_log.is_by_generator(repo, found):
+        return False
+    if commit_log.is_by_generator(repo, trees.commit_of(repo, to)):
+        _followed_by[configuration] = to
+    return True
+
+
+def _follows(repo: Repository, to: Oid, commit: Oid | None) -> bool:
+    # a commit of another repository may be asked for, or one that is gone
+    return to == commit or (
+        commit is not None and commit in repo and repo.descendant_of(to, commit)
+    )
 
 
 def refuse_other_render_version(repo: Repository, commit: Oid) -> None:
@@ -247,8 +259,7 @@ class Followed:
     @property
     def must_commit(self) -> bool:
         # also to say which configuration is in effect
-        now = self.snapshot
-        return bool(self.change.files) or now.told != (now.refused if now.faults else None)
+        return bool(self.change.files) or not self.snapshot.is_told
 
 
 def start_at(repo: Repository, tip: Oid, progress: Progress = lambda done, total: None) -> Snapshot:
@@ -283,9 +294,18 @@ def follow(
 ) -> Followed:
     """Return what is in effect at the commit ``to``, and the files that a generator must write.
 
-    Only files that differ are read. A configuration that was not valid is judged ``again`` only if
-    asked, as it may be valid once a claim has ended.
+    Only files that differ are read, unless people have set main back. A configuration that was not
+    valid is judged ``again`` if asked, or if people edit claims: it may be valid without a claim.
     """
+    is_later = _follows(repo, to, before.commit)
+    if not (is_later and _was_main(repo, to, before.configuration)):
+        try:
+            before = start_at(repo, to)
+        except InvalidInput as error:
+            raise StateRepoError(
+                f"main was rewritten, its configuration is not valid ({error.faults[0]}), and it "
+                "has no commit of a generator; correct the file, or set main back"
+            ) from None
     for commit, entry in commit_log.commits(repo, to, before.commit):
         if entry.by_generator and commit_log.is_by_generator(repo, commit):
             try:
@@ -298,27 +318,22 @@ def follow(
             break
     if before.commit == to and before.is_settled and not again:
         return Followed(before, before)
-    ids = config_ids(trees.commit_of(repo, to).tree)
-    in_effect = trees.commit_of(repo, before.configuration)
-    if ids == config_ids(in_effect.tree):
+    tree = trees.commit_of(repo, to).tree
+    ids = config_ids(tree)
+    if ids == config_ids(trees.commit_of(repo, before.configuration).tree):
         return _carried_out(
             repo, before, replace(before, commit=to, configuration=to, faults=(), refused=None), now
         )
     faults = before.faults
-    if ids != before.refused or again:
+    claims = trees.commit_of(repo, before.commit).tree, tree, (claim_files.LEDGER_ROOT,)
+    if ids != before.refused or again or trees.differ(*claims):
         try:
-            config = _judged(trees.commit_of(repo, to).tree, before.state)
+            config = _judged(tree, before.state)
             state = replace(before.state, config=config)
             return _carried_out(repo, before, Snapshot(to, state, to, told=before.told), now)
         except InvalidInput as error:
             faults = error.faults
-    configuration = _on_line(repo, to, before.configuration)
-    if configuration is None:
-        raise StateRepoError(
-            f"main was rewritten, its configuration is not valid ({faults[0]}), and no commit of "
-            "it has the one that was in effect; correct the file, or set main back"
-        )
-    held = replace(before, commit=to, configuration=configuration, faults=faults, refused=ids)
+    held = replace(before, commit=to, faults=faults, refused=ids)
     return _carried_out(repo, before, held, now)
 
 
@@ -412,7 +427,8 @@ def _judged(tree: Tree, before: State) -> Config:
     """Return the configuration of people's commit if it can be used, whatever is demanded."""
     in_effect = before.config.repo_settings.render_version
     key = (config_ids(tree), in_effect, frozenset(before.ledger.ended.items()))
-    if key not in _judgements:
+    judgement = _judgements.get(key)
+    if judgement is None:
         try:
             files = trees.texts(tree, CONFIG_ROOTS)
             if ROOT_FILE not in files:
@@ -428,13 +444,12 @@ def _judged(tree: Tree, before: State) -> Config:
                 # whether a configuration is valid must not depend on the machine
                 with suppress(OverLimit), processor_time(each=DEMAND_S, together=4 * DEMAND_S):
                     try_configuration(State(config, Ledger(ended=before.ledger.ended), EVALUATE))
-            judgement: Config | InvalidInput = config
+            judgement = config
         except InvalidInput as error:
             judgement = error
         if len(_judgements) >= _MOST_JUDGED:
             _judgements.clear()
         _judgements[key] = judgement
-    judgement = _judgements[key]
     if isinstance(judgement, InvalidInput):
         raise InvalidInput(judgement.faults)
     return judgement
