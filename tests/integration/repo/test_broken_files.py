@@ -137,6 +137,47 @@ def test_a_pull_that_makes_main_the_second_parent_stops_no_demand(
     assert differing(bare) == {}
 
 
+CLUSTERS = "inventory/clusters.yaml"
+MISTAKES: dict[str, list[tuple[str, str, str]]] = {
+    "a later commit changed the same file": [
+        (CLUSTERS, "kind: Clusters", "kind: X"),
+        (CLUSTERS, "kind: X", "# Petra\nkind: X"),
+    ],
+    "the file at fault refers to the one that changed": [(CLUSTERS, "c-its", "c-ity")],
+}
+
+
+@pytest.mark.parametrize("mistakes", MISTAKES.values(), ids=MISTAKES)
+@pytest.mark.parametrize("how", ["push", "pull"])
+def test_the_printed_revert_mends_main(
+    generator: Generator, bare: Path, person: Person, how: str, mistakes: list[tuple[str, str, str]]
+) -> None:
+    person.change({CLUSTERS: f"# Earlier, and valid\n{text(bare, CLUSTERS)}"})
+    rig.book(generator, goal(1))
+    before = text(bare, CLUSTERS)
+    person.fetch()
+    for path, old, new in mistakes:
+        file = person.folder / path
+        file.write_text(file.read_text().replace(old, new))
+        rig.git(person.folder, "commit", "-q", "-a", "-m", "A mistake")
+    if how == "pull":
+        person.change({"overrides/two.yaml": TWO})
+        rig.book(generator, goal(2))
+        rig.git(person.folder, "pull", "-q", "--no-rebase", "--no-edit")
+    rig.git(person.folder, "push", "-q", "origin", "HEAD:main")
+    rig.book(generator, goal(3))
+    repo = pygit2.Repository(str(bare))
+    _, _, revert = snapshots.how_to_mend(repo, generator.snapshot).partition("commits: git ")
+    person.fetch()
+    rig.git(person.folder, *revert.split())
+    rig.git(person.folder, "push", "-q", "origin", "HEAD:main")
+    rig.book(generator, goal(4))
+    assert generator.snapshot.problems == ()
+    assert text(bare, CLUSTERS) == before
+    assert bool(text(bare, "overrides/two.yaml")) is (how == "pull")
+    assert differing(bare) == {}
+
+
 def includes(generator: Generator, commit: str) -> bool:
     return generator.includes(str(generator.snapshot.commit), commit)
 
@@ -294,6 +335,20 @@ def test_a_forged_record_of_the_configuration_in_effect_stops_no_start(
     assert verdict.fault
     with rig.running(bare) as generator:
         rig.book(generator, goal(2))
+
+
+def test_a_submodule_in_place_of_a_claim_releases_nothing(generator: Generator, bare: Path) -> None:
+    rig.book(generator, goal(1), goal(2))
+    (path,) = rig.claims(bare, "fusion-1")
+    whole, index = text(bare, path), {"GIT_INDEX_FILE": str(bare / "index")}
+    rig.git(bare, "read-tree", "main", **index)
+    rig.git(bare, "update-index", "--cacheinfo", f"160000,{'1' * 40},{path}", **index)
+    tree = rig.git(bare, "write-tree", **index)
+    made = rig.git(bare, "commit-tree", tree, "-p", "main", "-m", "By hand")
+    rig.git(bare, "update-ref", "refs/heads/main", made)
+    rig.book(generator, goal(3))
+    assert text(bare, path) == whole
+    rig.assert_sound(bare)
 
 
 def test_a_forged_commit_with_an_invalid_claim_stops_no_demand(

@@ -571,7 +571,7 @@ def render_all(tree: Tree, state: State, more: Files = MappingProxyType({})) -> 
 # ---- what people are told of a configuration that is not in effect ----
 
 # How many faults get the commit that caused them, and how many commits are named to be reverted.
-_MOST_ORIGINS, _MOST_REVERTED = 100, 20
+_MOST_ORIGINS, _MOST_REVERTED = 100, 50
 
 
 class Problem(NamedTuple):
@@ -605,20 +605,35 @@ def problems_of(repo: Repository, snapshot: Snapshot) -> tuple[Problem, ...]:
 
 
 def commits_to_revert(repo: Repository, snapshot: Snapshot) -> list[str]:
-    """Return the commits of main, newest first, that changed the files at fault since then."""
-    files = [each.file for each in snapshot.faults if each.file]
-    found = list[str]()
-    for commit in commit_log.first_parents(repo, snapshot.commit):
-        if commit.id == snapshot.configuration or len(found) == _MOST_REVERTED:
-            break
-        if not commit_log.is_by_generator(repo, commit) and trees.differ(
-            trees.parent_tree(commit), commit.tree, files or CONFIG_ROOTS
-        ):
+    """Return the commits of main, newest first, that changed the files at fault since then.
+
+    Also the later ones that changed the same files as these, as a revert would else conflict.
+    """
+    in_effect = trees.commit_of(repo, snapshot.configuration).tree
+    tip = trees.commit_of(repo, snapshot.commit).tree
+    changed = {path for path, _ in trees.differences(in_effect, tip, CONFIG_ROOTS)}
+    files, found = {each.file for each in snapshot.faults}, list[str]()
+    # a file may be at fault because of another one
+    files = files if files <= changed else changed
+    people = commit_log.first_parents(repo, snapshot.commit, snapshot.configuration)
+    for commit in reversed([*people]):
+        # a merge into a branch also brought what is in effect
+        is_pull = len(commit.parents) > 1 and not _follows(
+            repo, commit.parent_ids[0], snapshot.configuration
+        )
+        if is_pull or commit_log.is_by_generator(repo, commit):
+            continue
+        before = trees.parent_tree(commit)
+        touched = {path for path, _ in trees.differences(before, commit.tree, CONFIG_ROOTS)}
+        if touched & files:
+            files = files | touched
             found.append(str(commit.id))
-    return found
+    return found[::-1]
 
 
 def how_to_mend(repo: Repository, snapshot: Snapshot) -> str:
-    commits = " ".join(commit[:10] for commit in commits_to_revert(repo, snapshot))
-    revert = f", or undo the commits: git revert --no-edit -m 1 {commits}" if commits else ""
-    return f"correct the files{revert}"
+    commits = commits_to_revert(repo, snapshot)
+    if not 0 < len(commits) <= _MOST_REVERTED:
+        return "correct the files"
+    named = " ".join(commit[:10] for commit in commits)
+    return f"correct the files, or undo the commits: git revert --no-edit -m 1 {named}"
