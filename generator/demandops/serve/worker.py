@@ -192,8 +192,6 @@ class Worker:
             self._demands.take(batch, self._batch_limit)
             if batch or self._ended_leases(self.snapshot):
                 self._publish(batch)
-                # without a claim that has ended, the configuration of main may be valid
-                self._must_judge = bool(self.snapshot.faults)
             elif not self._agenda.rest_left_s:
                 self._follow()
             if self._must_judge and not self._seconds_until_judging:
@@ -602,6 +600,9 @@ class Worker:
         if commits.tells:
             self._approvals.tell_of_faults(commits.head)
         before, self.snapshot = self.snapshot, commits.head
+        # without a claim or an override that has ended, the configuration of main may be valid
+        if self.snapshot.state.ledger is not commits.start.state.ledger:
+            self._must_judge = bool(self.snapshot.faults)
         # also true after a person's merge that needs no commit of the generator
         if self.snapshot.commit != before.commit:
             self._packs_since_tidy += 1

@@ -385,6 +385,8 @@ class _LedgerRead(NamedTuple):
     changes: list[ClaimChange]
     put_back: dict[str, Claim | None]
     faults: list[Fault]
+    # files of waiting demands that are not valid → their texts from before
+    waiting: dict[str, str]
 
     def state_with(self, before: State, config: Config) -> State:
         if config == before.config and self.ledger.ended == before.ledger.ended:
@@ -397,11 +399,16 @@ def _ledger_after(repo: Repository, before: Snapshot, commit: Commit) -> _Ledger
     ledger = replace(before.state.ledger, ended=records.read_ended_override(end_markers_at(new)))
     if trees.differ(old, new, (records.WAITING_ROOT,)):
         ledger = replace(ledger, waiting=_waiting(new))
-    changes, put_back, faults = (
-        list[ClaimChange](),
-        dict(before.put_back),
-        list(before.claim_faults),
-    )
+    changes, waiting = list[ClaimChange](), dict[str, str]()
+    put_back, faults = dict(before.put_back), list(before.claim_faults)
+    for path, blob in trees.differences(old, new, (records.WAITING_ROOT,)):
+        text = trees.read_text(old, path) or ""
+        waits = records.read_waiting(text, path)
+        # who deletes the file withdraws the demand
+        if blob is not None and waits and waits.demand not in ledger.waiting:
+            waiting[path] = text
+            ledger = replace(ledger, waiting=ledger.waiting.insert(waits.demand, waits))
+            faults.append(fault("", "is not a valid waiting demand").within(path))
     for path in ledger_files.changed_files(old, new):
         was = before.put_back.get(path) or ledger_files.valid_claim_at(old, path)
         put_back.pop(path, None)
@@ -411,11 +418,13 @@ def _ledger_after(repo: Repository, before: Snapshot, commit: Commit) -> _Ledger
                 raise InvalidInput(conflict)
         except InvalidInput as error:
             faults += error.faults
-            put_back[path] = claim = was or ledger_files.as_last_written(repo, commit.id, path)
+            if was is None and trees.entry(old, path) is not None:
+                was = ledger_files.as_last_written(repo, commit.id, path)
+            put_back[path] = claim = was
         if claim != was and (key := (claim or was)) is not None:
             changes.append(ClaimChange(was, claim))
             ledger = ledger.replace(key.key, claim)
-    return _LedgerRead(ledger, changes, put_back, faults)
+    return _LedgerRead(ledger, changes, put_back, faults, waiting)
 
 
 # By the ids of their files, the newest configurations that were judged.
@@ -510,6 +519,7 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
     }
     files: dict[str, str | None] = {
         **{path: claim_files.text_of(claim) if claim else None for path, claim in put_back.items()},
+        **read.waiting,
         **carried.files,
     }
     snapshot = replace(
