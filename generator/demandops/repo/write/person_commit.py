@@ -167,6 +167,6 @@ def _require_valid(repository: StateRepository, tip: Commit) -> None:
         problem = snapshots.problems_of(repository.objects, held)[0]
         raise StateRepoError(
             f"nothing of {MAIN_BRANCH}'s configuration is in effect, because it is not valid, so "
-            f"nothing was changed; first {snapshots.how_to_mend(repository.objects, held)}: "
-            f"{problem}"
+            f"nothing was changed: {problem}; first "
+            f"{snapshots.how_to_mend(repository.objects, held)}"
         )
