@@ -118,6 +118,7 @@ _TRIES = 5
 # How many times the duration of a judgement passes before a configuration that is not in effect is
 # judged again because claims have ended: each renders all releases.
 _JUDGING_PAUSE_FACTOR = 20
+_MOST_LOGGED = 20  # faults of claims, of which one commit may bring thousands
 _NAME = "writer"  # the thread's name, under which a health check reports its failure
 
 
@@ -574,8 +575,10 @@ class Worker:
         return commits
 
     def _tell_of_faults(self, snapshot: Snapshot) -> None:
-        for problem in snapshot.claim_faults:
+        for problem in snapshot.claim_faults[:_MOST_LOGGED]:
             log.error("put back as it was: %s", problem)
+        if (more := len(snapshot.claim_faults) - _MOST_LOGGED) > 0:
+            log.error("put back as it was: %d more faults of claims", more)
         # each fault of the configuration is logged once, until it is mended
         before, self._logged = self._logged, tuple(dict.fromkeys(snapshot.faults))
         if before == self._logged:

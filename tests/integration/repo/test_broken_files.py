@@ -351,6 +351,18 @@ def test_a_submodule_in_place_of_a_claim_releases_nothing(generator: Generator, 
     rig.assert_sound(bare)
 
 
+def test_a_commit_that_follows_one_that_is_gone_does_not_end_the_verification(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, goal(1))
+    gone = f"Operation: follow\nSince: {'1' * 40}\nRender-Version: 3"
+    person.change({"README.md": "x"}, f"x\n\nWhy: x\n\n{gone}", FORGER)
+    rig.book(generator, goal(2))
+    with reader.opened(str(bare)) as repo:
+        verdicts = repo.verify(repo.revisions(f"{rig.root(bare)}.."))
+    assert [verdict.holds for verdict in verdicts] == [True, False, True]
+
+
 def test_a_forged_commit_with_an_invalid_claim_stops_no_demand(
     address: str, bare: Path, person: Person
 ) -> None:
