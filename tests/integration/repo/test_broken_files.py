@@ -12,7 +12,7 @@ from random import Random
 import pygit2
 import pytest
 import yaml
-from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.errors import InvalidInput, Refused, StateRepoError
 from demandops.base.settings import GENERATED_ROOTS
 from demandops.repo import reader
 from demandops.repo.history import commit_log
@@ -176,6 +176,33 @@ def test_the_printed_revert_mends_main(
     assert text(bare, CLUSTERS) == before
     assert bool(text(bare, "overrides/two.yaml")) is (how == "pull")
     assert differing(bare) == {}
+
+
+def test_what_a_generator_booked_in_a_fork_is_a_persons_edit(
+    bare: Path, person: Person, tmp_path: Path
+) -> None:
+    """And what was booked here is not, though the quota is full by now."""
+    policy, fork = "policy/access-domains.yaml", tmp_path / "fork.git"
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        rig.git(tmp_path, "clone", "-q", "--bare", "--no-local", str(bare), str(fork))
+        rig.book(generator, goal(2))
+        full = yaml.safe_load(text(bare, policy))
+        for domain in full["domains"]:
+            domain["quotas"] = {"servicesPerNode": 2}
+        person.change({policy: yaml.safe_dump(full)})
+        with rig.running(fork) as other:
+            rig.book(other, goal(3))
+        person.fetch()
+        rig.git(person.folder, "fetch", "-q", str(fork), "main:fork")
+        rig.git(person.folder, "merge", "-q", "-X", "ours", "-m", "Merge the fork", "fork")
+        rig.git(person.folder, "push", "-q", "origin", "HEAD:main")
+        alone = snapshots.state_at(pygit2.Repository(str(bare)), rig.tip(bare)).state
+        with pytest.raises(Refused, match="servicesPerNode"):
+            generator.submit(goal(0)).future.result(rig.PATIENCE_S)
+        wanted = rig.books_after([goal(1), goal(2)])["services"]
+        assert {*rig.books(bare)["services"]} == {*wanted}
+        assert {*alone.ledger} == {*generator.snapshot.state.ledger}
 
 
 def includes(generator: Generator, commit: str) -> bool:

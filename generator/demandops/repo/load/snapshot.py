@@ -265,7 +265,9 @@ class Followed:
 def start_at(repo: Repository, tip: Oid, progress: Progress = lambda done, total: None) -> Snapshot:
     """Return what the newest commit of a generator has in effect, else the tip if it is valid."""
     told: InvalidInput | StateRepoError | None = None
-    for commit in repo.walk(tip):
+    # Along the first parents, as a person may merge what a generator has booked in a fork. If main
+    # was pulled into a branch, `follow` goes on from here to the newest one.
+    for commit in commit_log.first_parents(repo, tip):
         if commit_log.is_by_generator(repo, commit):
             # it may be forged, or of a newer program
             try:
@@ -307,7 +309,9 @@ def follow(
                 "has no commit of a generator; correct the file, or set main back"
             ) from None
     for commit, entry in commit_log.commits(repo, to, before.commit):
-        if entry.by_generator and commit_log.is_by_generator(repo, commit):
+        is_ours = entry.by_generator and commit_log.is_by_generator(repo, commit)
+        # not one of a fork, which a person has merged
+        if is_ours and _follows(repo, commit.id, before.commit):
             try:
                 before = _taken_over(repo, before, commit, entry)
             except StateRepoError as refused:  # unless people have put this right since
