@@ -265,20 +265,28 @@ class Followed:
 def start_at(repo: Repository, tip: Oid, progress: Progress = lambda done, total: None) -> Snapshot:
     """Return what the newest commit of a generator has in effect, else the tip if it is valid."""
     told: InvalidInput | StateRepoError | None = None
-    # Along the first parents, as a person may merge what a generator has booked in a fork. If main
-    # was pulled into a branch, `follow` goes on from here to the newest one.
-    for commit in commit_log.first_parents(repo, tip):
-        if commit_log.is_by_generator(repo, commit):
-            # it may be forged, or of a newer program
-            try:
-                return load(repo, commit.id, progress, commit_log.entry_of(commit))
-            except (InvalidInput, StateRepoError) as error:
-                told = error
-            break
+    main = commit_log.first_parents(repo, tip)
+    for first in (commit for commit in main if commit_log.is_by_generator(repo, commit)):
+        # there is a later one if main was pulled into a branch
+        commit = next((later for later, _ in _by_generator(repo, tip, first.id)), first)
+        # it may be forged, or of a newer program
+        try:
+            return load(repo, commit.id, progress, commit_log.entry_of(commit))
+        except (InvalidInput, StateRepoError) as error:
+            told = error
+        break
     try:
         return replace(load(repo, tip, progress), is_rendered=False)
     except (InvalidInput, StateRepoError) as error:
         raise told or error from None
+
+
+def _by_generator(repo: Repository, to: Oid, after: Oid) -> Iterator[tuple[Commit, LogEntry]]:
+    # newest first; without those of a fork, which a person has merged
+    for commit, entry in commit_log.commits(repo, to, after):
+        is_ours = entry.by_generator and commit_log.is_by_generator(repo, commit)
+        if is_ours and _follows(repo, commit.id, after):
+            yield commit, entry
 
 
 def state_at(
@@ -308,18 +316,15 @@ def follow(
                 f"main was rewritten, its configuration is not valid ({error.faults[0]}), and it "
                 "has no commit of a generator; correct the file, or set main back"
             ) from None
-    for commit, entry in commit_log.commits(repo, to, before.commit):
-        is_ours = entry.by_generator and commit_log.is_by_generator(repo, commit)
-        # not one of a fork, which a person has merged
-        if is_ours and _follows(repo, commit.id, before.commit):
+    for commit, entry in _by_generator(repo, to, before.commit):
+        try:
+            before = _taken_over(repo, before, commit, entry)
+        except StateRepoError as refused:  # unless people have put this right since
             try:
-                before = _taken_over(repo, before, commit, entry)
-            except StateRepoError as refused:  # unless people have put this right since
-                try:
-                    before = replace(load(repo, to), is_rendered=False)
-                except (InvalidInput, StateRepoError):
-                    raise refused from None
-            break
+                before = replace(load(repo, to), is_rendered=False)
+            except (InvalidInput, StateRepoError):
+                raise refused from None
+        break
     if before.commit == to and before.is_settled and not again:
         return Followed(before, before)
     tree = trees.commit_of(repo, to).tree
