@@ -194,7 +194,6 @@ def _was_main(repo: Repository, to: Oid, configuration: Oid) -> bool:
 
     It is along the first parents of ``to`` or of a generator's commit, or is a generator's.
     """
-
     if _follows(repo, to, _followed_by.get(configuration)):
         return True
     if not _follows(repo, to, configuration):
@@ -427,9 +426,10 @@ def _ledger_after(repo: Repository, before: Snapshot, commit: Commit) -> _Ledger
                 raise InvalidInput(conflict)
         except InvalidInput as error:
             faults += error.faults
+            claim = was
             if was is None and trees.entry(old, path) is not None:
-                was = ledger_files.as_last_written(repo, commit.id, path)
-            put_back[path] = claim = was
+                claim = ledger_files.as_last_written(repo, commit.id, path)
+            put_back[path] = claim
         if claim != was and (key := (claim or was)) is not None:
             changes.append(ClaimChange(was, claim))
             ledger = ledger.replace(key.key, claim)
