@@ -229,9 +229,9 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         if verdict.skipped:
             yield verdict
             continue
-        verdict = replace(verdict, touched=tuple(sorted(disallowed_files(repo, commit, entry))))
         before, proof = proof, None  # proof stays None if the commit cannot be read
         try:
+            verdict = replace(verdict, touched=tuple(sorted(disallowed_files(repo, commit, entry))))
             if whole or place == len(commits) or entry.first("In-Force"):
                 state = _loaded(repo, commit, entry)
                 parent = trees.parent_tree(commit) if _holds(state) else None

@@ -134,6 +134,7 @@ _JUDGING_PAUSE_FACTOR = 20
 # before it counts as refused: with a verdict of the server, and without one, as the connection may
 # have failed.
 _REFUSALS, _REFUSALS_WITHOUT_VERDICT = 2, 6
+_MOST_LOGGED = 20  # faults of claims, of which one commit may bring thousands
 _NAME = "writer"  # the thread's name, under which a health check reports its failure
 
 
@@ -215,8 +216,6 @@ class Worker:
             self._demands.take(batch, self._batch_limit)
             if batch or self._ended_leases(self.snapshot):
                 self._publish(batch)
-                # without a claim that has ended, the configuration of main may be valid
-                self._must_judge = bool(self.snapshot.faults)
             elif not self._agenda.waits_s("all"):
                 self._follow()
             if self._must_judge and not self._seconds_until_judging:
@@ -655,8 +654,10 @@ class Worker:
         return commits
 
     def _tell_of_faults(self, snapshot: Snapshot) -> None:
-        for problem in snapshot.claim_faults:
+        for problem in snapshot.claim_faults[:_MOST_LOGGED]:
             log.error("put back as it was: %s", problem)
+        if (more := len(snapshot.claim_faults) - _MOST_LOGGED) > 0:
+            log.error("put back as it was: %d more faults of claims", more)
         # each fault of the configuration is logged once, until it is mended
         before, self._logged = self._logged, tuple(dict.fromkeys(snapshot.faults))
         if before == self._logged:
@@ -681,6 +682,9 @@ class Worker:
         if commits.tells:
             self._approvals.tell_of_faults(commits.head)
         before, self.snapshot = self.snapshot, commits.head
+        # without a claim or an override that has ended, the configuration of main may be valid
+        if self.snapshot.state.ledger is not commits.start.state.ledger:
+            self._must_judge = bool(self.snapshot.faults)
         # also true after a person's merge that needs no commit of the generator
         if self.snapshot.commit != before.commit:
             self._packs_since_tidy += 1

@@ -12,7 +12,7 @@ from random import Random
 import pygit2
 import pytest
 import yaml
-from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.errors import InvalidInput, Refused, StateRepoError
 from demandops.base.settings import GENERATED_ROOTS
 from demandops.repo import reader
 from demandops.repo.history import commit_log
@@ -112,6 +112,98 @@ def test_a_merge_of_any_style_is_judged_and_so_is_a_second_one_of_the_same_branc
         rig.book(generator, goal(4))
         assert generator.snapshot.problems == ()
     assert differing(bare) == {}
+
+
+def test_a_pull_that_makes_main_the_second_parent_stops_no_demand(
+    bare: Path, person: Person
+) -> None:
+    """No trailer shows that what was merged before was in effect, so what was before it is."""
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        person.write({"overrides/broken.yaml": BROKEN})
+        for command in ("add .", "commit -q -m Mine"):
+            rig.git(person.folder, *command.split())
+        node = {"id": "one", "type": "vehicle", "cluster": "c-its"}
+        nodes = {"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": [node]}
+        merged = person.change({"inventory/nodes/one.yaml": yaml.safe_dump(nodes)})
+        generator.fetch_now()
+        rig.wait_until(lambda: includes(generator, merged), "it is followed")
+        rig.git(person.folder, "pull", "-q", "--no-rebase", "--no-edit")
+        rig.git(person.folder, "push", "-q", "origin", "HEAD:main")
+        rig.book(generator, goal(2))
+        assert [one.file for one in generator.snapshot.problems] == ["overrides/broken.yaml"]
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(3))
+    assert differing(bare) == {}
+
+
+CLUSTERS = "inventory/clusters.yaml"
+MISTAKES: dict[str, list[tuple[str, str, str]]] = {
+    "a later commit changed the same file": [
+        (CLUSTERS, "kind: Clusters", "kind: X"),
+        (CLUSTERS, "kind: X", "# Petra\nkind: X"),
+    ],
+    "the file at fault refers to the one that changed": [(CLUSTERS, "c-its", "c-ity")],
+}
+
+
+@pytest.mark.parametrize("mistakes", MISTAKES.values(), ids=MISTAKES)
+@pytest.mark.parametrize("how", ["push", "pull"])
+def test_the_printed_revert_mends_main(
+    generator: Generator, bare: Path, person: Person, how: str, mistakes: list[tuple[str, str, str]]
+) -> None:
+    person.change({CLUSTERS: f"# Earlier, and valid\n{text(bare, CLUSTERS)}"})
+    rig.book(generator, goal(1))
+    before = text(bare, CLUSTERS)
+    person.fetch()
+    for path, old, new in mistakes:
+        file = person.folder / path
+        file.write_text(file.read_text().replace(old, new))
+        rig.git(person.folder, "commit", "-q", "-a", "-m", "A mistake")
+    if how == "pull":
+        person.change({"overrides/two.yaml": TWO})
+        rig.book(generator, goal(2))
+        rig.git(person.folder, "pull", "-q", "--no-rebase", "--no-edit")
+    rig.git(person.folder, "push", "-q", "origin", "HEAD:main")
+    rig.book(generator, goal(3))
+    repo = pygit2.Repository(str(bare))
+    _, _, revert = snapshots.how_to_mend(repo, generator.snapshot).partition("commits: git ")
+    person.fetch()
+    rig.git(person.folder, *revert.split())
+    rig.git(person.folder, "push", "-q", "origin", "HEAD:main")
+    rig.book(generator, goal(4))
+    assert generator.snapshot.problems == ()
+    assert text(bare, CLUSTERS) == before
+    assert bool(text(bare, "overrides/two.yaml")) is (how == "pull")
+    assert differing(bare) == {}
+
+
+def test_what_a_generator_booked_in_a_fork_is_a_persons_edit(
+    bare: Path, person: Person, tmp_path: Path
+) -> None:
+    """And what was booked here is not, though the quota is full by now."""
+    policy, fork = "policy/access-domains.yaml", tmp_path / "fork.git"
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        rig.git(tmp_path, "clone", "-q", "--bare", "--no-local", str(bare), str(fork))
+        rig.book(generator, goal(2))
+        full = yaml.safe_load(text(bare, policy))
+        for domain in full["domains"]:
+            domain["quotas"] = {"servicesPerNode": 2}
+        person.change({policy: yaml.safe_dump(full)})
+        with rig.running(fork) as other:
+            rig.book(other, goal(3))
+        person.fetch()
+        rig.git(person.folder, "fetch", "-q", str(fork), "main:fork")
+        rig.git(person.folder, "merge", "-q", "-X", "ours", "-m", "Merge the fork", "fork")
+        rig.git(person.folder, "push", "-q", "origin", "HEAD:main")
+        alone = snapshots.state_at(pygit2.Repository(str(bare)), rig.tip(bare)).state
+        with pytest.raises(Refused, match="servicesPerNode"):
+            generator.submit(goal(0)).future.result(rig.PATIENCE_S)
+        wanted = rig.books_after([goal(1), goal(2)])["services"]
+        assert {*rig.books(bare)["services"]} == {*wanted}
+        running = generator.snapshot.state
+        assert {c.key for c in alone.ledger} == {c.key for c in running.ledger}
 
 
 def includes(generator: Generator, commit: str) -> bool:
@@ -271,6 +363,32 @@ def test_a_forged_record_of_the_configuration_in_effect_stops_no_start(
     assert verdict.fault
     with rig.running(bare) as generator:
         rig.book(generator, goal(2))
+
+
+def test_a_submodule_in_place_of_a_claim_releases_nothing(generator: Generator, bare: Path) -> None:
+    rig.book(generator, goal(1), goal(2))
+    (path,) = rig.claims(bare, "fusion-1")
+    whole, index = text(bare, path), {"GIT_INDEX_FILE": str(bare / "index")}
+    rig.git(bare, "read-tree", "main", **index)
+    rig.git(bare, "update-index", "--cacheinfo", f"160000,{'1' * 40},{path}", **index)
+    tree = rig.git(bare, "write-tree", **index)
+    made = rig.git(bare, "commit-tree", tree, "-p", "main", "-m", "By hand")
+    rig.git(bare, "update-ref", "refs/heads/main", made)
+    rig.book(generator, goal(3))
+    assert text(bare, path) == whole
+    rig.assert_sound(bare)
+
+
+def test_a_commit_that_follows_one_that_is_gone_does_not_end_the_verification(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    rig.book(generator, goal(1))
+    gone = f"Operation: follow\nSince: {'1' * 40}\nRender-Version: 3"
+    person.change({"README.md": "x"}, f"x\n\nWhy: x\n\n{gone}", FORGER)
+    rig.book(generator, goal(2))
+    with reader.opened(str(bare)) as repo:
+        verdicts = repo.verify(repo.revisions(f"{rig.root(bare)}.."))
+    assert [verdict.holds for verdict in verdicts] == [True, False, True]
 
 
 def test_a_forged_commit_with_an_invalid_claim_stops_no_demand(

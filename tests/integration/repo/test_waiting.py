@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from demandops.model.ledger import records
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.agenda import Agenda
 from demandops.serve.generator import Generator
@@ -45,6 +46,24 @@ def _put(name: str, **more: Any) -> dict[str, Any]:
 
 def _runs(bare: Path) -> list[str]:
     return sorted(rig.books(bare)["services"])
+
+
+def test_a_waiting_demand_that_a_person_breaks_waits_on_until_its_file_is_deleted(
+    generator: Generator, bare: Path, person: Person
+) -> None:
+    person.change(_with_room_for_one(bare))
+    outcomes = [rig.outcome(generator.submit(_put(name))) for name in "abc"]
+    assert outcomes == ["booked", "waiting", "waiting"]
+    paths = {name: records.waiting_path(name) for name in "bc"}
+    whole = file_of(bare, paths["b"])
+    person.change({paths["b"]: "kind: nonsense\n", paths["c"]: None})
+    release = {"kind": "Demand", "demand": "a", "requesters": ["vehicle00"], "operation": "release"}
+    rig.book(generator, _put("d"))
+    assert file_of(bare, paths["b"]) == whole
+    rig.book(generator, release)
+    rig.wait_until(lambda: "b" in str(_runs(bare)), "b runs")
+    assert not file_of(bare, paths["c"])
+    rig.assert_sound(bare)
 
 
 def test_a_waiting_demand_whose_answer_was_lost_is_answered_again(

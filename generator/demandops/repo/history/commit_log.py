@@ -155,9 +155,13 @@ def _with_checked_signatures(
     ]
 
 
-def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
+def first_parents(
+    repo: Repository, tip: str | Oid, after: str | Oid | None = None
+) -> Iterator[Commit]:
     walker = repo.walk(commit_of(repo, tip).id)
     walker.simplify_first_parent()
+    if after is not None:
+        walker.hide(commit_of(repo, after).id)
     return iter(walker)
 
 

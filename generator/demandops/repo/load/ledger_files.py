@@ -45,8 +45,8 @@ def read_claims(files: Iterable[tuple[str, str]]) -> ClaimFiles:
 
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
-    text = trees.read_text(tree, path)
-    return claim_files.read(text, path) if text is not None else None
+    child = trees.entry(tree, path)  # a folder or a submodule has no text, so it is no valid claim
+    return claim_files.read(trees.text_of(child), path) if child is not None else None
 
 
 def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:

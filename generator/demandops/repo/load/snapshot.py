@@ -73,9 +73,12 @@ class Snapshot:
 
     @property
     def is_settled(self) -> bool:
-        """Whether nothing is left to judge, to render or to put back."""
-        is_judged = bool(self.faults) or self.told is None
-        return self.is_rendered and not self.put_back and is_judged
+        """Whether nothing is left to judge, to render, to put back or to tell."""
+        return self.is_rendered and not self.put_back and self.is_told
+
+    @property
+    def is_told(self) -> bool:
+        return self.told == (self.refused if self.faults else None)
 
     @property
     def problems(self) -> tuple[Fault, ...]:
@@ -174,7 +177,7 @@ def configuration_of(repo: Repository, commit: Commit, entry: LogEntry | None) -
     if not named:
         return commit.id
     found = trees.commit_of(repo, named).id
-    if _on_line(repo, commit.id, found) != found:
+    if not _was_main(repo, commit.id, found):
         raise StateRepoError(
             f"commit {commit.id} names {named} as its configuration, which is no commit before it; "
             "set the branch back to the commit before it"
@@ -182,28 +185,36 @@ def configuration_of(repo: Repository, commit: Commit, entry: LogEntry | None) -
     return found
 
 
-# By the commit of a configuration, the newest one that has it along its first parents. Else each
-# commit that is made while main is not valid would be followed back to it.
-_on_line_of: dict[Oid, Oid] = {}
+# By the commit of a configuration, the newest generator's commit that is known to follow it.
+_followed_by: dict[Oid, Oid] = {}
 
 
-def _on_line(repo: Repository, to: Oid, configuration: Oid) -> Oid | None:
-    """Return ``configuration``, or if people have rewritten main, a commit with the same files.
+def _was_main(repo: Repository, to: Oid, configuration: Oid) -> bool:
+    """Return whether a commit was main before ``to``, because people merge what they looked at.
 
-    People merge only what they have looked at, so a commit counts if it was main once: it is along
-    the first parents, or a generator's.
+    It is along the first parents of ``to`` or of a generator's commit, or is a generator's.
     """
-    wanted, same = trees.commit_of(repo, configuration), None
-    ids = config_ids(wanted.tree)
-    for commit in commit_log.first_parents(repo, to):
-        if commit.id in (configuration, _on_line_of.get(configuration)):
-            _on_line_of[configuration] = to
-            return configuration
-        if same is None and config_ids(commit.tree) == ids:
-            same = commit.id
-    if repo.descendant_of(to, configuration) and commit_log.is_by_generator(repo, wanted):
-        return configuration
-    return same
+    if _follows(repo, to, _followed_by.get(configuration)):
+        return True
+    if not _follows(repo, to, configuration):
+        return False
+    main = {to}
+    for commit, entry in commit_log.commits(repo, to, configuration):
+        if commit.id in main or (entry.by_generator and commit_log.is_by_generator(repo, commit)):
+            main.update(commit.parent_ids[:1])
+    found = trees.commit_of(repo, configuration)
+    if configuration not in main and not commit_log.is_by_generator(repo, found):
+        return False
+    if commit_log.is_by_generator(repo, trees.commit_of(repo, to)):
+        _followed_by[configuration] = to
+    return True
+
+
+def _follows(repo: Repository, to: Oid, commit: Oid | None) -> bool:
+    # a commit of another repository may be asked for, or one that is gone
+    return to == commit or (
+        commit is not None and commit in repo and repo.descendant_of(to, commit)
+    )
 
 
 def refuse_other_render_version(repo: Repository, commit: Oid) -> None:
@@ -247,13 +258,17 @@ class Followed:
     @property
     def must_commit(self) -> bool:
         # also to say which configuration is in effect
-        now = self.snapshot
-        return bool(self.change.files) or now.told != (now.refused if now.faults else None)
+        return bool(self.change.files) or not self.snapshot.is_told
 
 
 def newest_of_generator(repo: Repository, tip: Oid) -> LogEntry | None:
-    by_generator = (c for c in repo.walk(tip) if commit_log.is_by_generator(repo, c))
-    return next(map(commit_log.entry_of, by_generator), None)
+    line = commit_log.first_parents(repo, tip)
+    first = next((commit for commit in line if commit_log.is_by_generator(repo, commit)), None)
+    if first is None:
+        return None
+    # there is a later one if main was pulled into a branch
+    later = next((commit for commit, _ in _by_generator(repo, tip, first.id)), first)
+    return commit_log.entry_of(later)
 
 
 def start_at(repo: Repository, tip: Oid, progress: Progress = lambda done, total: None) -> Snapshot:
@@ -268,6 +283,14 @@ def start_at(repo: Repository, tip: Oid, progress: Progress = lambda done, total
         return replace(load(repo, tip, progress), is_rendered=False)
     except (InvalidInput, StateRepoError) as error:
         raise told or error from None
+
+
+def _by_generator(repo: Repository, to: Oid, after: Oid) -> Iterator[tuple[Commit, LogEntry]]:
+    # newest first; without those of a fork, which a person has merged
+    for commit, entry in commit_log.commits(repo, to, after):
+        is_ours = entry.by_generator and commit_log.is_by_generator(repo, commit)
+        if is_ours and _follows(repo, commit.id, after):
+            yield commit, entry
 
 
 def state_at(
@@ -285,42 +308,45 @@ def follow(
 ) -> Followed:
     """Return what is in effect at the commit ``to``, and the files that a generator must write.
 
-    Only files that differ are read. A configuration that was not valid is judged ``again`` only if
-    asked, as it may be valid once a claim has ended.
+    Only files that differ are read, unless people have set main back. A configuration that was not
+    valid is judged ``again`` if asked, or if people edit claims: it may be valid without a claim.
     """
-    for commit, entry in commit_log.commits(repo, to, before.commit):
-        if entry.by_generator and commit_log.is_by_generator(repo, commit):
+    is_later = _follows(repo, to, before.commit)
+    if not (is_later and _was_main(repo, to, before.configuration)):
+        try:
+            before = start_at(repo, to)
+        except InvalidInput as error:
+            raise StateRepoError(
+                f"main was rewritten, its configuration is not valid ({error.faults[0]}), and it "
+                "has no commit of a generator; correct the file, or set main back"
+            ) from None
+    for commit, entry in _by_generator(repo, to, before.commit):
+        try:
+            before = _taken_over(repo, before, commit, entry)
+        except StateRepoError as refused:  # unless people have put this right since
             try:
-                before = _taken_over(repo, before, commit, entry)
-            except StateRepoError as refused:  # unless people have put this right since
-                try:
-                    before = replace(load(repo, to), is_rendered=False)
-                except (InvalidInput, StateRepoError):
-                    raise refused from None
-            break
+                before = replace(load(repo, to), is_rendered=False)
+            except (InvalidInput, StateRepoError):
+                raise refused from None
+        break
     if before.commit == to and before.is_settled and not again:
         return Followed(before, before)
-    ids = config_ids(trees.commit_of(repo, to).tree)
-    in_effect = trees.commit_of(repo, before.configuration)
-    if ids == config_ids(in_effect.tree):
+    tree = trees.commit_of(repo, to).tree
+    ids = config_ids(tree)
+    if ids == config_ids(trees.commit_of(repo, before.configuration).tree):
         return _carried_out(
             repo, before, replace(before, commit=to, configuration=to, faults=(), refused=None), now
         )
     faults = before.faults
-    if ids != before.refused or again:
+    claims = trees.commit_of(repo, before.commit).tree, tree, (claim_files.LEDGER_ROOT,)
+    if ids != before.refused or again or trees.differ(*claims):
         try:
-            config = _judged(trees.commit_of(repo, to).tree, before.state)
+            config = _judged(tree, before.state)
             state = replace(before.state, config=config)
             return _carried_out(repo, before, Snapshot(to, state, to, told=before.told), now)
         except InvalidInput as error:
             faults = error.faults
-    configuration = _on_line(repo, to, before.configuration)
-    if configuration is None:
-        raise StateRepoError(
-            f"main was rewritten, its configuration is not valid ({faults[0]}), and no commit of "
-            "it has the one that was in effect; correct the file, or set main back"
-        )
-    held = replace(before, commit=to, configuration=configuration, faults=faults, refused=ids)
+    held = replace(before, commit=to, faults=faults, refused=ids)
     return _carried_out(repo, before, held, now)
 
 
@@ -372,6 +398,8 @@ class _LedgerRead(NamedTuple):
     changes: list[ClaimChange]
     put_back: dict[str, Claim | None]
     faults: list[Fault]
+    # files of waiting demands that are not valid → their texts from before
+    waiting: dict[str, str]
 
     def state_with(self, before: State, config: Config) -> State:
         if config == before.config and self.ledger.ended == before.ledger.ended:
@@ -384,11 +412,16 @@ def _ledger_after(repo: Repository, before: Snapshot, commit: Commit) -> _Ledger
     ledger = replace(before.state.ledger, ended=records.read_ended_override(end_markers_at(new)))
     if trees.differ(old, new, (records.WAITING_ROOT,)):
         ledger = replace(ledger, waiting=_waiting(new))
-    changes, put_back, faults = (
-        list[ClaimChange](),
-        dict(before.put_back),
-        list(before.claim_faults),
-    )
+    changes, waiting = list[ClaimChange](), dict[str, str]()
+    put_back, faults = dict(before.put_back), list(before.claim_faults)
+    for path, blob in trees.differences(old, new, (records.WAITING_ROOT,)):
+        text = trees.read_text(old, path) or ""
+        waits = records.read_waiting(text, path)
+        # who deletes the file withdraws the demand
+        if blob is not None and waits and waits.demand not in ledger.waiting:
+            waiting[path] = text
+            ledger = replace(ledger, waiting=ledger.waiting.insert(waits.demand, waits))
+            faults.append(fault("", "is not a valid waiting demand").within(path))
     for path in ledger_files.changed_files(old, new):
         was = before.put_back.get(path) or ledger_files.valid_claim_at(old, path)
         put_back.pop(path, None)
@@ -398,11 +431,14 @@ def _ledger_after(repo: Repository, before: Snapshot, commit: Commit) -> _Ledger
                 raise InvalidInput(conflict)
         except InvalidInput as error:
             faults += error.faults
-            put_back[path] = claim = was or ledger_files.as_last_written(repo, commit.id, path)
+            claim = was
+            if was is None and trees.entry(old, path) is not None:
+                claim = ledger_files.as_last_written(repo, commit.id, path)
+            put_back[path] = claim
         if claim != was and (key := (claim or was)) is not None:
             changes.append(ClaimChange(was, claim))
             ledger = ledger.replace(key.key, claim)
-    return _LedgerRead(ledger, changes, put_back, faults)
+    return _LedgerRead(ledger, changes, put_back, faults, waiting)
 
 
 # By the ids of their files, the newest configurations that were judged.
@@ -414,7 +450,8 @@ def _judged(tree: Tree, before: State) -> Config:
     """Return the configuration of people's commit if it can be used, whatever is demanded."""
     in_effect = before.config.repo_settings.render_version
     key = (config_ids(tree), in_effect, frozenset(before.ledger.ended.items()))
-    if key not in _judgements:
+    judgement = _judgements.get(key)
+    if judgement is None:
         try:
             files = trees.texts(tree, CONFIG_ROOTS)
             if ROOT_FILE not in files:
@@ -430,13 +467,12 @@ def _judged(tree: Tree, before: State) -> Config:
                 # whether a configuration is valid must not depend on the machine
                 with suppress(OverLimit), processor_time(each=DEMAND_S, together=4 * DEMAND_S):
                     try_configuration(State(config, Ledger(ended=before.ledger.ended), EVALUATE))
-            judgement: Config | InvalidInput = config
+            judgement = config
         except InvalidInput as error:
             judgement = error
         if len(_judgements) >= _MOST_JUDGED:
             _judgements.clear()
         _judgements[key] = judgement
-    judgement = _judgements[key]
     if isinstance(judgement, InvalidInput):
         raise InvalidInput(judgement.faults)
     return judgement
@@ -497,6 +533,7 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
     }
     files: dict[str, str | None] = {
         **{path: claim_files.text_of(claim) if claim else None for path, claim in put_back.items()},
+        **read.waiting,
         **carried.files,
     }
     snapshot = replace(
@@ -558,7 +595,7 @@ def render_all(tree: Tree, state: State, more: Files = MappingProxyType({})) -> 
 # ---- what people are told of a configuration that is not in effect ----
 
 # How many faults get the commit that caused them, and how many commits are named to be reverted.
-_MOST_ORIGINS, _MOST_REVERTED = 100, 20
+_MOST_ORIGINS, _MOST_REVERTED = 100, 50
 
 
 class Problem(NamedTuple):
@@ -592,20 +629,35 @@ def problems_of(repo: Repository, snapshot: Snapshot) -> tuple[Problem, ...]:
 
 
 def commits_to_revert(repo: Repository, snapshot: Snapshot) -> list[str]:
-    """Return the commits of main, newest first, that changed the files at fault since then."""
-    files = [each.file for each in snapshot.faults if each.file]
-    found = list[str]()
-    for commit in commit_log.first_parents(repo, snapshot.commit):
-        if commit.id == snapshot.configuration or len(found) == _MOST_REVERTED:
-            break
-        if not commit_log.is_by_generator(repo, commit) and trees.differ(
-            trees.parent_tree(commit), commit.tree, files or CONFIG_ROOTS
-        ):
+    """Return the commits of main, newest first, that changed the files at fault since then.
+
+    Also the later ones that changed the same files as these, as a revert would else conflict.
+    """
+    in_effect = trees.commit_of(repo, snapshot.configuration).tree
+    tip = trees.commit_of(repo, snapshot.commit).tree
+    changed = {path for path, _ in trees.differences(in_effect, tip, CONFIG_ROOTS)}
+    files, found = {each.file for each in snapshot.faults}, list[str]()
+    # a file may be at fault because of another one
+    files = files if files <= changed else changed
+    people = commit_log.first_parents(repo, snapshot.commit, snapshot.configuration)
+    for commit in reversed([*people]):
+        # a merge into a branch also brought what is in effect
+        is_pull = len(commit.parents) > 1 and not _follows(
+            repo, commit.parent_ids[0], snapshot.configuration
+        )
+        if is_pull or commit_log.is_by_generator(repo, commit):
+            continue
+        before = trees.parent_tree(commit)
+        touched = {path for path, _ in trees.differences(before, commit.tree, CONFIG_ROOTS)}
+        if touched & files:
+            files = files | touched
             found.append(str(commit.id))
-    return found
+    return found[::-1]
 
 
 def how_to_mend(repo: Repository, snapshot: Snapshot) -> str:
-    commits = " ".join(commit[:10] for commit in commits_to_revert(repo, snapshot))
-    revert = f", or undo the commits: git revert --no-edit -m 1 {commits}" if commits else ""
-    return f"correct the files{revert}"
+    commits = commits_to_revert(repo, snapshot)
+    if not 0 < len(commits) <= _MOST_REVERTED:
+        return "correct the files"
+    named = " ".join(commit[:10] for commit in commits)
+    return f"correct the files, or undo the commits: git revert --no-edit -m 1 {named}"

@@ -138,15 +138,15 @@ class CommitBatch:
         causes = commit_log.person_commits_since(
             self._objects, before.configuration, self.start.commit
         )
-        held = self.head.faults
-        self.tells = bool(held) and self.head.told != self.head.refused
+        self.tells = bool(self.head.faults) and not self.head.is_told
+        told = self.head if self.tells else replace(self.head, faults=())
         text = commit_message.of_follow(
             change.releases,
             str(self.start.commit),
             str(before.commit),
-            str(self.head.configuration) if held else "",
-            snapshots.problems_of(self._objects, self.head) if self.head.problems else (),
-            snapshots.how_to_mend(self._objects, self.head) if held else "",
+            str(told.configuration) if told.faults else "",
+            snapshots.problems_of(self._objects, told),
+            snapshots.how_to_mend(self._objects, told) if told.faults else "",
             [
                 *of_overrides,
                 *commit_message.demand_trailers(followed.keys),
@@ -175,7 +175,7 @@ class CommitBatch:
             # the author is the person who last changed the node's file, and so drained the node
             config = decision.state.config
             file = config.file_of(NODES_FILE, config.host_of(node))
-            changes = commit_log.changes_to(self._objects, self.start.commit, file)
+            changes = commit_log.changes_to(self._objects, self.start.configuration, file)
             by_people = (change.entry for change in changes if not change.entry.by_generator)
             causes = [trees.commit_of(self._objects, e.commit) for e in islice(by_people, 1)]
             caused_by = commit_log.caused_by_trailers(causes)

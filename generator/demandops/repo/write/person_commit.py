@@ -179,6 +179,6 @@ def _require_valid(repository: StateRepository, tip: Commit) -> None:
     if held.faults:
         raise StateRepoError(
             f"nothing of {MAIN_BRANCH}'s configuration is in effect, because it is not valid, so "
-            f"nothing was changed; first {snapshots.how_to_mend(objects, held)}: "
-            f"{snapshots.problems_of(objects, held)[0]}"
+            f"nothing was changed: {snapshots.problems_of(objects, held)[0]}; first "
+            f"{snapshots.how_to_mend(objects, held)}"
         )
