@@ -32,11 +32,13 @@ def test_options_that_are_not_given_are_asked_for(checkout: Path) -> None:
 
 @pytest.mark.nightly  # sees whole seconds pass
 def test_a_slow_fetch_is_shown_while_it_lasts(state: GitRepo, tmp_path: Path) -> None:
-    config = tmp_path / "gitconfig"
-    config.write_text('[remote "origin"]\n\tuploadpack = sleep 1.5 && git-upload-pack\n')
-    url = state.path.as_uri()
+    slow = tmp_path / "slow-ssh"
+    slow.write_text('#!/bin/sh\nsleep 1.5\nexec sh -c "$2"\n')
+    slow.chmod(0o755)
+    url = f"ssh://host{state.path}"
     get = ("get", "demands", "-o", "name", "--state-repo", url)
-    with Dialogue(*get, folder=tmp_path, GIT_CONFIG_GLOBAL=str(config)) as talk:
+    ssh = {"GIT_SSH_COMMAND": str(slow), "GIT_SSH_VARIANT": "simple"}
+    with Dialogue(*get, folder=tmp_path, **ssh) as talk:
         assert talk.end() == 0, talk.text
     shown, _, after = talk.text.rpartition("\x1b[2K")
     assert f"fetching {url}, 1 s" in shown
