@@ -215,13 +215,13 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
         "the nodes have positions",
     )
     drawn = fleet_map.picture(follower.newest, Filter(""), "")
-    assert (drawn.layout, drawn.layouts) == ("place", ("cluster", "place"))
-    for layout in drawn.layouts:
-        cards = fleet_map.picture(follower.newest, Filter(""), layout).nodes
+    assert (drawn["layout"], drawn["layouts"]) == ("place", ("cluster", "place"))
+    for layout in drawn["layouts"]:
+        cards = fleet_map.picture(follower.newest, Filter(""), layout)["nodes"]
         for one in cards:
             assert one.x >= 0 and one.x + one.width <= fleet_map.WIDTH
             assert not [o for o in cards if o is not one and _cover(one, o)]
-    by_id = {card.id: card for card in drawn.nodes}
+    by_id = {card.id: card for card in drawn["nodes"]}
     ids = [node["id"] for node in nodes["nodes"]]
     assert by_id[ids[0]].x < by_id[ids[1]].x < by_id[ids[2]].x
     assert by_id[ids[-1]].y < by_id[ids[0]].y

@@ -201,8 +201,8 @@ def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:
         one.demand for one in now.commit_state.state.ledger if "vehicle01" in one.requesters
     )
     lit = fleet_map.picture(now, Filter(f"demand={demand}"), "")
-    assert {node.id for node in lit.nodes if node.is_lit} == {"edge", "station00", "vehicle01"}
-    services = {one.name for node in lit.nodes for one in node.services if one.is_lit}
+    assert {node.id for node in lit["nodes"] if node.is_lit} == {"edge", "station00", "vehicle01"}
+    services = {one.name for node in lit["nodes"] for one in node.services if one.is_lit}
     assert DETECTION not in services and "od-edge-station00" in services
 
 
@@ -213,14 +213,14 @@ def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: F
     now = changed(follower, config=replace(config, nodes=nodes))
     state = now.commit_state.state
     drawn = fleet_map.picture(now, Filter(""), "")
-    assert (drawn.nodes, drawn.total) == ((), len(state.config.nodes))
-    squares = sum(mass.path.count("M") for mass in drawn.many_nodes)
+    assert (drawn["nodes"], drawn["total"]) == ([], len(state.config.nodes))
+    squares = sum(path.count("M") for _, path in drawn["many_nodes"])
     assert squares == len(state.config.nodes)
     few = fleet_map.picture(now, Filter("node=far7"), "")
-    assert [node.id for node in few.nodes] == ["far7"] and few.only_lit
+    assert [node.id for node in few["nodes"]] == ["far7"] and few["only_lit"]
     # the filter finds too many nodes to draw them alone, so the whole fleet is drawn
     many = fleet_map.picture(now, Filter("node:far"), "")
-    assert many.is_dimmed and {node.id for node in many.nodes} == set(far)
+    assert many["is_dimmed"] and {node.id for node in many["nodes"]} == set(far)
 
 
 def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
@@ -244,7 +244,7 @@ def test_the_time_line_fills_the_drawing(shown: Shown) -> None:
     strip = time_line.strip(events, events[0].time, "all", None)
     template = (Path(time_line.__file__).parent / "pages" / "timeline.html.j2").read_text()
     width = int(re.findall(r'x2="(\d+)"', template)[0])
-    assert max(dot.x for dot in strip.dots) > 0.9 * width
+    assert max(dot["x"] for dot in strip["dots"]) > 0.9 * width
 
 
 def test_no_name_of_a_page_module_is_bound_twice() -> None:
