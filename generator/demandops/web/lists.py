@@ -24,9 +24,6 @@ from demandops.web.situation import RANKS, WORDS, ReusableRows, Situation, word_
 # How many rows a page of a list has at most.
 PAGE = 100
 
-# How many texts of a cell the page shows.
-_MOST_PARTS = 4
-
 
 @dataclass(frozen=True, slots=True)
 class Link:
@@ -52,14 +49,6 @@ class Cell:
     order: float | str | None = None  # by default the time or the first text
 
     @property
-    def shown(self) -> tuple[Part, ...]:
-        return self.parts[:_MOST_PARTS]
-
-    @property
-    def more(self) -> int:
-        return max(0, len(self.parts) - _MOST_PARTS)
-
-    @property
     def rank(self) -> tuple[bool, float, str]:
         # in ascending order, empty cells come last
         if (order := self.order) is None:
@@ -67,12 +56,6 @@ class Cell:
         if isinstance(order, str):
             return order == "", 0.0, order.casefold()
         return False, float(order), ""
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    key: str
-    title: str
 
 
 @dataclass(frozen=True)
@@ -93,17 +76,6 @@ class Row:
     @cached_property
     def all_texts(self) -> str:
         return "\n".join(text for texts in self.texts.values() for text in texts)
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
-    total: int  # of all rows of the list
-    matching: int
-    sort: str  # the key of a column, with `-` in front for the reverse order
-    page: int
-    pages: int
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
@@ -145,19 +117,6 @@ def exactly(key: str, value: str) -> str:
     return shlex.quote(f"{key}={value}")
 
 
-def table(
-    columns: Sequence[Column], rows: Iterable[Row], wanted: Filter, sort: str, page: int
-) -> Table:
-    every = list(rows)
-    matching = [row for row in every if wanted.matches(row)]
-    key = sort.removeprefix("-")
-    if key not in {column.key for column in columns}:
-        sort = key = columns[0].key
-    matching.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
-    shown, page, pages = page_of(matching, page, PAGE)
-    return Table(tuple(columns), tuple(shown), len(every), len(matching), sort, page, pages)
-
-
 def page_of(items: Sequence[Item], page: int, size: int) -> tuple[Sequence[Item], int, int]:
     pages = max(1, -(-len(items) // size))
     page = min(max(page, 1), pages)
@@ -170,10 +129,9 @@ Values: TypeAlias = "tuple[Any, ...]"
 
 
 class ListKind:
-    name: str  # in addresses
     title: str
     about: str
-    columns: tuple[Column, ...]
+    columns: Mapping[str, str]  # the titles, by the keys of a row's cells
     entries: Callable[[Situation], Iterator[tuple[str, Values]]]  # each with its id
     # Makes a row of the values of an entry. While these stay the same, it is called again only if
     # the configuration or the overrides have changed.
@@ -200,12 +158,11 @@ def _requesters(requesters: Iterable[str]) -> Cell:
     return _linked("demands", "requester", requesters)
 
 
-def _columns(keys_and_titles: str) -> tuple[Column, ...]:
-    return tuple(Column(*column.split("|")) for column in keys_and_titles.split(", "))
+def _columns(keys_and_titles: str) -> dict[str, str]:
+    return dict(column.split("|") for column in keys_and_titles.split(", "))
 
 
 class DemandsList(ListKind):
-    name = "demands"
     title = "Demands"
     about = "What requesters hold, until they release it or its lease ends."
     columns = _columns(
@@ -249,7 +206,6 @@ class DemandsList(ListKind):
 
 
 class ServicesList(ListKind):
-    name = "services"
     title = "Services"
     about = "One row for each Helm release: a service on a node, shared by all who need it."
     columns = _columns(
@@ -284,7 +240,6 @@ class ServicesList(ListKind):
 
 
 class ConnectionsList(ListKind):
-    name = "connections"
     title = "Connections"
     about = "Topics that are carried from one node to another."
     columns = _columns(
@@ -328,7 +283,6 @@ class ConnectionsList(ListKind):
 
 
 class LeasesList(ListKind):
-    name = "leases"
     title = "Leases"
     about = "Claims that end unless their requester renews them. The first to end comes first."
     columns = _columns(
@@ -359,7 +313,10 @@ class LeasesList(ListKind):
 
 
 LISTS: dict[str, ListKind] = {
-    kind.name: kind for kind in (DemandsList(), ServicesList(), ConnectionsList(), LeasesList())
+    "demands": DemandsList(),
+    "services": ServicesList(),
+    "connections": ConnectionsList(),
+    "leases": LeasesList(),
 }
 
 

@@ -35,9 +35,10 @@ from demandops.model.config.base_model import relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
 from demandops.views.release_causes import override_state
-from demandops.web import fleet_map, lists, not_ready, release_view, time_line
+from demandops.web import fleet_map, lists, not_ready, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Link, Row, rows_of
+from demandops.web.release_view import explained_demand, explained_release
 from demandops.web.situation import Situation
 
 # ---- the views, by address ----
@@ -48,7 +49,7 @@ _KEPT = ("at", "q")
 NAVIGATION = (
     ("", "Not ready"),
     ("map", "Map"),
-    *((kind.name, kind.title) for kind in LISTS.values()),
+    *((name, kind.title) for name, kind in LISTS.items()),
     ("timeline", "Time line"),
     ("overrides", "Overrides"),
     ("rates", "Rates"),
@@ -102,21 +103,22 @@ def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _list(asked: ViewRequest) -> tuple[str, Data]:
-    kind = LISTS[asked.path]
-    rows = rows_of(asked.situation, kind.name)
-    table = lists.table(kind.columns, rows, asked.filter, asked.get("sort"), asked.page())
-    return "list.html.j2", {"kind": kind, "table": table}
-
-
-def _demand(asked: ViewRequest) -> tuple[str, Data]:
-    now, reader = asked.situation, asked.follower.reader()
-    return "demand.html.j2", {"demand": release_view.explained_demand(now, reader, asked.get("id"))}
-
-
-def _release(asked: ViewRequest) -> tuple[str, Data]:
-    now, reader = asked.situation, asked.follower.reader()
-    release = release_view.explained_release(now, reader, asked.get("name"))
-    return "release.html.j2", {"release": release}
+    kind, sort = LISTS[asked.path], asked.get("sort")  # `-` before a key is the reverse order
+    rows = rows_of(asked.situation, asked.path)
+    matching = [row for row in rows if asked.filter.matches(row)]
+    if (key := sort.removeprefix("-")) not in kind.columns:
+        sort = key = next(iter(kind.columns))
+    matching.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
+    shown, page, pages = lists.page_of(matching, asked.page(), lists.PAGE)
+    return "list.html.j2", {
+        "kind": kind,
+        "rows": shown,
+        "total": len(rows),
+        "matching": len(matching),
+        "sort": sort,
+        "page": page,
+        "pages": pages,
+    }
 
 
 def _timeline(asked: ViewRequest) -> tuple[str, Data]:
@@ -179,8 +181,14 @@ VIEWS: Mapping[str, View] = {
         {"map": fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))},
     ),
     **{f"/{name}": _list for name in LISTS},
-    "/demand": _demand,
-    "/release": _release,
+    "/demand": lambda asked: (
+        "demand.html.j2",
+        {"demand": explained_demand(asked.situation, asked.follower.reader(), asked.get("id"))},
+    ),
+    "/release": lambda asked: (
+        "release.html.j2",
+        {"release": explained_release(asked.situation, asked.follower.reader(), asked.get("name"))},
+    ),
     "/timeline": _timeline,
     "/overrides": _overrides,
     "/rates": _rates,
