@@ -25,6 +25,7 @@ from demandops.views import release_causes
 _LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
 # Topic → the requesters of the topic, sorted.
 _Requesters: TypeAlias = dict[str, list[str]]
+Json: TypeAlias = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,49 +56,15 @@ class ConnectionEntry:
 
 
 @dataclass(frozen=True, slots=True)
-class SuspendedEntry:
-    kind: str
-    id: str
-    demand: str
-    requesters: list[str]
-    override: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class WaitingEntry:
-    demand: str
-    requesters: list[str]
-    since: str
-    priority: int
-
-
-@dataclass(frozen=True, slots=True)
-class ResourceEntry:
-    """What services request of a node's resource, and the capacity, as Kubernetes quantities."""
-
-    requested: str
-    capacity: str
-
-
-@dataclass(frozen=True, slots=True)
-class DemandEntry:
-    action: Literal["Demand", "DeploymentRequest"]  # the ROS action that takes such a demand
-    request: str
-    requesters: list[str]
-    # applications that it does not list, each with those that read its outputs
-    held_for: dict[str, list[str]]
-
-
-@dataclass(frozen=True, slots=True)
 class Bookkeeping:
     services: dict[str, ServiceEntry]  # by release name; all mappings are sorted
     connections: dict[str, ConnectionEntry]
     # also those whose claims are suspended, but no service or connection counts these claims
-    demands: dict[str, DemandEntry]
-    suspended: list[SuspendedEntry]
-    nodes: dict[str, dict[str, ResourceEntry]]  # that declare a capacity
-    waiting: list[WaitingEntry]  # in the order of the tries to book
+    demands: dict[str, Json]
+    suspended: list[Json]
+    # of those that declare a capacity, what services request of each resource, and the capacity
+    nodes: dict[str, dict[str, Json]]
+    waiting: list[Json]  # in the order of the tries to book
 
 
 def bookkeeping(world: World) -> Bookkeeping:
@@ -149,57 +116,68 @@ def bookkeeping(world: World) -> Bookkeeping:
             listed=_sorted(dict(sorted(listed.items()))),
         )
     suspended = [
-        SuspendedEntry(
-            claim.subject.kind.value[:-1],
-            claim.subject.id,
-            claim.demand,
-            list(claim.requesters),
-            override.path,
-            override.reason,
-        )
+        {
+            "kind": claim.subject.kind.value[:-1],
+            "id": claim.subject.id,
+            "demand": claim.demand,
+            "requesters": list(claim.requesters),
+            "override": override.path,
+            "reason": override.reason,
+        }
         for claim, override in suspended_claims(world)
     ]
     waiting = [
-        WaitingEntry(
-            demand.demand,
-            list(demand.requesters),
-            demand.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
-            demand.put.priority,
-        )
+        {
+            "demand": demand.demand,
+            "requesters": list(demand.requesters),
+            "since": demand.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "priority": demand.put.priority,
+        }
         for demand in in_turn(world.ledger.waiting)
     ]
+    services = dict(sorted(services.items()))
+    demands = _demands(world)
+    return Bookkeeping(services, connections, demands, suspended, _nodes(world), waiting)
+
+
+def _demands(world: World) -> dict[str, Json]:
     by_demand: dict[str, list[Claim]] = {}
     subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
     for claim in (claim for subject in subjects for claim in world.ledger.claims_on(subject)):
         if claim.keeping_override is None:  # a claim that an override keeps is of no demand
             by_demand.setdefault(claim.demand, []).append(claim)
-    demands = {
-        demand: DemandEntry(
-            "DeploymentRequest" if claims[0].joined else "Demand",
-            claims[0].request,
-            list(requesters_of(claims)),
-            {
-                claim.subject.id: list(claim.application.held_for)
-                for claim in claims
-                if claim.is_on_application and claim.application.held_for
-            },
-        )
-        for demand, claims in sorted(by_demand.items())
-    }
-    services = dict(sorted(services.items()))
-    return Bookkeeping(services, connections, demands, suspended, _nodes(world), waiting)
+    demands: dict[str, Json] = {}
+    for demand, claims in sorted(by_demand.items()):
+        demands[demand] = {
+            # the ROS action that takes such a demand
+            "action": "DeploymentRequest" if claims[0].joined else "Demand",
+            "request": claims[0].request,
+            "requesters": list(requesters_of(claims)),
+        }
+        # applications that it does not list, each with those that read its outputs
+        held_for = {
+            claim.subject.id: list(claim.application.held_for)
+            for claim in claims
+            if claim.is_on_application and claim.application.held_for
+        }
+        if held_for:
+            demands[demand]["held_for"] = held_for
+    return demands
 
 
-def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
+def _nodes(world: World) -> dict[str, dict[str, Json]]:
     usage, config = whole_usage(world), world.config
-    nodes: dict[str, dict[str, ResourceEntry]] = {}
+    nodes: dict[str, dict[str, Json]] = {}
     # A machine that is in several access domains is one entry, because it has one capacity.
     machines = {id: node for id, node in config.nodes.items() if id not in config.hosts}
     for id, node in sorted(machines.items()):
         names = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
         limits = ((name, node.most(name)) for name in sorted(names))
         resources = {
-            name: ResourceEntry(amount_text(usage.of(id, name), name), amount_text(most, name))
+            name: {
+                "requested": amount_text(usage.of(id, name), name),
+                "capacity": amount_text(most, name),
+            }
             for name, most in limits
             if most is not None
         }
@@ -225,9 +203,6 @@ def carried_topics(entry: Mapping[str, Any]) -> _Requesters:
 
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
     data = asdict(view) | {"commit": commit}
-    for entry in data["demands"].values():
-        if not entry["held_for"]:
-            del entry["held_for"]
     for entry in data["connections"].values():
         for name in ("targets", "listed"):
             if not entry[name]:

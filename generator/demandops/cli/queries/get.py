@@ -272,10 +272,7 @@ class _Nodes(Kind):
 
     def items(self, source: Source) -> list[Json]:
         world = source.snapshot.state
-        return [
-            {**asdict(node), "position": node.position.model_dump() if node.position else None}
-            for node in demand_lists.nodes(world, release_causes.releases(world))
-        ]
+        return demand_lists.nodes(world, release_causes.releases(world))
 
 
 class _Overrides(Kind):
