@@ -109,6 +109,14 @@ def _holds(item: Json, now: datetime) -> list[str]:
     return [*item["applications"], *item["connections"]]
 
 
+def _asked_topics(topics: Mapping[str, list[str]], item: Json) -> list[str]:
+    # a topic is followed by its requesters if the item has others too
+    return [
+        topic if who == item["requesters"] else f"{topic} ({', '.join(who)})"
+        for topic, who in topics.items()
+    ]
+
+
 def _ago(key: str) -> CellOf:
     return lambda item, now: relative(parse_time(item[key]), now) if item[key] else ""
 
@@ -176,7 +184,7 @@ class _Connections(Kind):
         column("To", "target", 1),
         column("Requesters", joined("requesters"), 3, wraps=True),
     )
-    wide = (column("Topics", lambda item, now: list(carried_topics(item))),)
+    wide = (column("Topics", lambda item, now: _asked_topics(carried_topics(item), item), 4),)
     filters = _COMMON | {"node": lambda item: [item["source"], item["target"]]}
 
     def items(self, source: Source) -> list[Json]:
@@ -364,11 +372,15 @@ class _Services(Kind):
     wide = (
         column(
             "Takes in",
-            lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
+            lambda item, now: [
+                line for topics in item["inputs"].values() for line in _asked_topics(topics, item)
+            ],
+            6,
         ),
         column(
             "Parameters",
             lambda item, now: [f"{name} = {value}" for name, value in item["parameters"].items()],
+            7,
         ),
     )
     filters = _COMMON | {"node": _key("node"), "application": _key("applications")}
