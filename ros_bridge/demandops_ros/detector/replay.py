@@ -313,7 +313,7 @@ def as_data(replay: Replay) -> dict[str, Any]:
                 "entities": list(event.subjects),
                 "change": "start" if event.starts else "stop",
                 "reason": event.why,
-                "action": None if goal is None else goal.action_name,
+                "action": None if goal is None else goal.action,
                 "goal": None if goal is None else goal.document,
             }
             for event, goal in replay.events

@@ -77,8 +77,8 @@ def test_a_failing_release_names_who_can_mend_it(follower: Follower, reason: str
     health = Health("reconciled", reason, "HelmRelease perception/od-edge-vehicle00", failing=True)
     now = with_health(follower, od_edge_vehicle00=health)
     (cause,) = causes(now, follower)
-    assert cause.remedy.who.startswith(who)
-    assert cause.remedy.command == "kubectl -n perception describe helmrelease od-edge-vehicle00"
+    assert cause.who.startswith(who)
+    assert cause.command == "kubectl -n perception describe helmrelease od-edge-vehicle00"
     assert cause.told == f"HelmRelease perception/od-edge-vehicle00: {reason}"
     assert cause.applications == ("edge/object_detection_fusion",)
     assert cause.requesters == ("station00", "vehicle00")
@@ -92,7 +92,7 @@ def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
     now = with_health(follower, **dict.fromkeys(names, away))
     (cause,) = causes(now, follower)
     assert cause.kind == "waiting" and len(cause.releases) == len(names)
-    assert cause.remedy.who == "the operator of cluster c-its"
+    assert cause.who == "the operator of cluster c-its"
     assert cause.why == "cannot be seen, because cluster c-its cannot be read"
 
 
@@ -106,7 +106,7 @@ def test_a_failing_release_without_images_in_the_registry_names_its_maintainer(
     bare = replace(release, service=release.service.model_copy(update={"images": ()}))
     config = commit_state.config
     found = remedy_of("failing", bare, config, health.object, health.reason, lambda path: None)
-    assert found.who == "the maintainer of appdefs/object-detection-fusion"
+    assert found[0] == "the maintainer of appdefs/object-detection-fusion"
 
 
 def test_not_everything_is_ready_while_a_cluster_is_not_watched(
@@ -134,8 +134,8 @@ def test_an_old_bootstrap_file_and_an_object_of_no_release_are_causes(follower: 
     now = replace(follower.newest, old_bootstraps=(old,), orphans=(left,))
     told = {cause.what.text: cause for cause in causes(now, follower)}
     assert told.keys() == {"bootstrap/c-its.yaml", "Deployment perception/mqtt-gone"}
-    assert told["bootstrap/c-its.yaml"].remedy.command == old.command
-    assert told["Deployment perception/mqtt-gone"].remedy.command == left.command
+    assert told["bootstrap/c-its.yaml"].command == old.command
+    assert told["Deployment perception/mqtt-gone"].command == left.command
 
 
 def test_a_filter_finds_words_fields_and_exact_values(look: Look) -> None:
