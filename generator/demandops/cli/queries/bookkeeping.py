@@ -5,7 +5,8 @@ from __future__ import annotations
 import click
 
 from demandops.cli.json_output import output_option, show, time_text
-from demandops.cli.output import at_option, progress, warn_of_problems
+from demandops.cli.output import at_option
+from demandops.cli.queries.diff import loaded
 from demandops.cli.queries.get import KINDS
 from demandops.cli.table import Table, column, joined, table_of
 from demandops.cli.target import state_repo_option
@@ -27,9 +28,7 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
       demandops bookkeeping --at 14:03 -o json
     """
     with reader.opened(state_repo) as repo:
-        with progress("reading the ledger") as report:
-            snapshot = repo.snapshot(at, report)
-        warn_of_problems(repo, snapshot)
+        snapshot = loaded(repo, at)
     commit = str(snapshot.commit)
     data = as_data(derive(snapshot.state), commit)
     capacity = [

@@ -22,11 +22,10 @@ from demandops.cli.output import (
     at_option,
     errors,
     painted,
-    progress,
     version_lines,
     warn_of_not_rendered,
-    warn_of_problems,
 )
+from demandops.cli.queries.diff import loaded
 from demandops.cli.table import CellOf, Column, Table, column, joined, table_of
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.model.config.base_model import duration_text, parse_time, relative
@@ -136,14 +135,15 @@ def _key(name: str) -> Values:
 _COMMON = {"node": _key("nodes"), "requester": _key("requesters"), "domain": _key("domains")}
 
 
-def _subject_lines(item: Json) -> list[str]:
-    held_for = [f"held for {id}" for id in item["held_for"]]
-    return ["{kind} {id}".format(**item["subject"]), *held_for]
-
-
 class _Claims(Kind):
     columns = (
-        column("Subject", lambda item, now: _subject_lines(item)),
+        column(
+            "Subject",
+            lambda item, now: [
+                "{kind} {id}".format(**item["subject"]),
+                *(f"held for {id}" for id in item["held_for"]),
+            ],
+        ),
         column("Requesters", joined("requesters"), 1, wraps=True),
         column("State", "state", 2),
         column("Since", _ago("since"), 3),
@@ -516,9 +516,7 @@ def get(
 
 
 def _read_source(repo: Reader, at: str | None) -> Source:
-    with progress("reading the ledger") as report:
-        snapshot = repo.snapshot(at, report)
-    warn_of_problems(repo, snapshot)
+    snapshot = loaded(repo, at)
     not_rendered = repo.not_rendered(snapshot) if at is None else frozenset()
     warn_of_not_rendered(not_rendered)
     return Source(repo, snapshot, REAL.now(), not_rendered)
