@@ -131,7 +131,8 @@ class Goal:
 
     @property
     def requesters(self) -> tuple[str, ...]:
-        return tuple(sorted({*requesters_in(self.action, self.data)}))
+        lists = requester_lists(self.action, self.data)
+        return tuple(sorted({id for _, ids in lists for id in ids}))
 
     @property
     def document(self) -> Mapping[str, Any]:
@@ -169,12 +170,11 @@ class Goal:
     ) -> Values | None:
         """Return the entities of the event for which the rule made a booked demand, or ``None``."""
         action, booked_id, requesters = booked
-        named = {*requesters_in(self.action, self.data)}
-        if len(requesters) > len(named) or action != self.action:
+        if len(requesters) > len(self.requesters) or action != self.action:
             return None
         # The id alone may not tell the entities: ``{entity}-{other}`` can give ``a-b-c`` in two
         # ways. So the requesters are read as well, and each combination is tried.
-        pairs = [(self.id, booked_id), *product(sorted(named), requesters)]
+        pairs = [(self.id, booked_id), *product(self.requesters, requesters)]
         entities: dict[str, set[str]] = {name: set() for name in subjects}
         for template, text in pairs:
             for name, entity in candidates(template, text).items():
@@ -187,14 +187,17 @@ class Goal:
         return None
 
 
-def requesters_in(action: Action, data: Mapping[str, Any]) -> Iterator[str]:
+def requester_lists(action: Action, data: Mapping[str, Any]) -> Iterator[tuple[str, Sequence[str]]]:
+    # each with its place in the goal
     if action == "Demand":
-        yield from data.get("requesters", ())
+        yield "requesters", data.get("requesters", ())
         return
-    for app in data.get("apps", ()):
-        yield from app.get("object_detection_fusion_app", {}).get("requester_ids", ())
-    for connection in data.get("connections", ()):
-        yield from connection.get("requester_ids", ())
+    kind = "object_detection_fusion_app"
+    for index, app in enumerate(data.get("apps", ())):
+        ids = app.get(kind, {}).get("requester_ids", ())
+        yield f"apps[{index}].{kind}.requester_ids", ids
+    for index, connection in enumerate(data.get("connections", ())):
+        yield f"connections[{index}].requester_ids", connection.get("requester_ids", ())
 
 
 # ---- the checks of what a rule demands: the template's names, the demand's form and ids ----
@@ -253,7 +256,7 @@ def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fau
     if template.action == "Demand":
         yield from _missing(data, field, "demand", "requesters")
         why = "otherwise two events would share one demand"
-        listed = [("demand", [data.get("demand", "")])]
+        listed: list[tuple[str, Sequence[str]]] = [("demand", [data.get("demand", "")])]
         for name, what in (("demand", "id"), ("requesters", "requesters")):
             for path, text in texts(data.get(name, ()), f"{field}.{name}"):
                 if changing := sorted(names(text) - {"rule", "entity", "other"}):
@@ -264,15 +267,7 @@ def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fau
     else:
         yield from _missing(data, field, "id")
         why = "a shutdown ends what its requesters joined, so each event needs its own requesters"
-        kind = "object_detection_fusion_app"
-        listed = [
-            (f"apps[{index}].{kind}.requester_ids", app.get(kind, {}).get("requester_ids", []))
-            for index, app in enumerate(data.get("apps", ()))
-        ]
-        listed += [
-            (f"connections[{index}].requester_ids", connection.get("requester_ids", []))
-            for index, connection in enumerate(data.get("connections", ()))
-        ]
+        listed = [*requester_lists(template.action, data)]
     for path, values in listed:
         missing = needed - {f"{{{name}}}" for value in values for name in names(value)}
         if missing and any(values):

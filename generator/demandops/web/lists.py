@@ -17,7 +17,7 @@ from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
 from demandops.views import demand_lists
-from demandops.web.situation import RANKS, WORDS, ReusableRows, Situation, word_of, worst_word
+from demandops.web.situation import RANKS, WORDS, Situation, word_of, worst_word
 
 # ---- lists that can be filtered, sorted and paged, as plain values ----
 
@@ -322,15 +322,15 @@ LISTS: dict[str, ListKind] = {
 
 def rows_of(now: Situation, name: str) -> list[Row]:
     commit_state, kind = now.commit_state, LISTS[name]
-    reusable = commit_state.rows.get(name, ReusableRows(None, {}))
+    statuses, shown = commit_state.rows.get(name, (None, {}))
     # the follower makes a new mapping of statuses whenever it looks, so the same mapping means that
     # nothing has changed
-    if reusable.statuses is not now.statuses:
+    if statuses is not now.statuses:
         rows: dict[str, tuple[Values, Row]] = {}
         for id, values in kind.entries(now):
-            before = reusable.rows.get(id)
+            before = shown.get(id)
             if before is None or before[0] != values:
                 before = values, kind.row(commit_state.state, *values)
             rows[id] = before
-        reusable = commit_state.rows[name] = ReusableRows(now.statuses, rows)
-    return [row for _, row in reusable.rows.values()]
+        commit_state.rows[name], shown = (now.statuses, rows), rows
+    return [row for _, row in shown.values()]

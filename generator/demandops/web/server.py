@@ -123,8 +123,12 @@ def _list(asked: ViewRequest) -> tuple[str, Data]:
 
 def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     now, lane = asked.situation, asked.get("lane")
-    events = time_line.events(asked.follower.history, asked.follower.health_changes)
-    events = time_line.matching(events, asked.filter, lane if lane in time_line.LANES else "")
+    lanes = {lane} if lane in time_line.LANES else time_line.LANES
+    events = [
+        event
+        for event in time_line.events(asked.follower.history, asked.follower.health_changes)
+        if event.lane in lanes and (not asked.filter or asked.filter.matches(event.row()))
+    ]
     chosen = None if now.is_newest else (now.commit_state.entry.time, now.commit_state.commit)
     changed: list[str] = []
     if asked.get("at"):

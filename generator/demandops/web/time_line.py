@@ -13,7 +13,7 @@ from typing import Any
 from demandops.model.config.base_model import span
 from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.repo.history.commit_message import PROPOSAL
-from demandops.web.lists import Filter, Row, cell
+from demandops.web.lists import Row, cell
 from demandops.web.situation import WORDS, Commit, HealthChange
 
 # ---- the time line of events ----
@@ -86,14 +86,6 @@ def of_commit(commit: Commit) -> Event:
         lane = "overrides"
     who = ", ".join(entry.trailers.get("Requester", ())) or entry.author
     return Event(lane, entry.time, word, entry.summary, who, entry.commit)
-
-
-def matching(events: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
-    return [
-        event
-        for event in events
-        if lane in ("", event.lane) and (not wanted or wanted.matches(event.row()))
-    ]
 
 
 def strip(

@@ -60,7 +60,7 @@ def editing(command: target.Command) -> target.Command:
         )
         return command(options=options, **given)
 
-    options = (
+    return target.with_options(
         person_change.reason_option,
         click.option(
             "--propose",
@@ -73,11 +73,7 @@ def editing(command: target.Command) -> target.Command:
         target.writable_repo_option,
         target.signing_option,
         json_output.output_option,
-    )
-    added: target.Command = run
-    for option in reversed(options):
-        added = option(added)
-    return added
+    )(run)
 
 
 selecting = target.name_options(
@@ -93,6 +89,17 @@ selecting = target.name_options(
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
     return {name: list(values) for name, values in given.items() if values}
 
+
+effect_options = target.with_options(
+    click.option("--hold", is_flag=True, help="Keep the rendered files as they are."),
+    click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims."),
+    click.option(
+        "--keep", is_flag=True, help="Keep services running after their last demand ends."
+    ),
+    click.option(
+        "--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas."
+    ),
+)
 
 # ---- ``demandops override``: create or end an override ----
 
@@ -121,10 +128,7 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
 @override.command()
 @click.argument("name", metavar="NAME", callback=_new_name)
 @selecting
-@click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
-@click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
-@click.option("--keep", is_flag=True, help="Keep services running after their last demand ends.")
-@click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas.")
+@effect_options
 @click.option("--on", "target", metavar="NODE", help="Move services to this node.")
 @click.option(
     "--use-version", "version", metavar="WORD", help="Pin the chart to a version or channel."

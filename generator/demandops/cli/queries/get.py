@@ -58,8 +58,8 @@ class Source:
 
 class Kind:
     items: Callable[[Source], list[Json]]  # each with a ``name``
-    columns: Sequence[tuple[Column, CellOf]]
-    wide: Sequence[tuple[Column, CellOf]]  # further columns for `-o wide`
+    columns: Sequence[Column]
+    wide: Sequence[Column]  # further columns for `-o wide`
     # An item is listed if the option matches one of the values that its filter returns.
     filters: ClassVar[Mapping[str, Values]]
 
