@@ -9,6 +9,7 @@ from fnmatch import translate
 from functools import partial
 from math import floor, hypot, inf
 from statistics import median
+from typing import Any
 
 from demandops.detect.condition import Count, Hours, Near, Threshold, Together
 from demandops.detect.observations import Cell, Event, Key, Observation, Phase, State, Who
@@ -167,15 +168,13 @@ def distance(last: Observation, other: Observation) -> float:
     return hypot(last.position[0] - other.position[0], last.position[1] - other.position[1])
 
 
-def compiled(rule: Rule) -> CompiledRule:
-    condition = rule.condition
-    if isinstance(condition, Near | Count):
-        return AreaRule(rule, condition)
-    if isinstance(condition, Together):
-        return PairRule(rule, condition)
-    if isinstance(condition, Threshold):
-        return ThresholdRule(rule, condition)
-    return HoursRule(rule, condition)
+_COMPILED: Mapping[type, Callable[[Rule, Any], CompiledRule]] = {
+    Near: AreaRule,
+    Count: AreaRule,
+    Together: PairRule,
+    Threshold: ThresholdRule,
+    Hours: HoursRule,
+}
 
 
 # ---- an index of areas by position, so that an entity is compared only with those near it ----
@@ -233,7 +232,8 @@ class EventEngine:
         self.pairs: dict[str, list[PairRule]] = {name: [] for name in file.sources}
         areas = defaultdict[str, list[AreaRule]](list)
         for each in file.rules:
-            rule = self.rules[each.name] = compiled(each)
+            rule = _COMPILED[type(each.condition)](each, each.condition)
+            self.rules[each.name] = rule
             for source in dict.fromkeys(rule.sources):
                 if isinstance(rule, AreaRule):
                     areas[source].append(rule)

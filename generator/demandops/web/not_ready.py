@@ -20,7 +20,7 @@ from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import GENERATOR_NAME
 from demandops.views import release_causes
 from demandops.web.lists import Cell, Filter, Link, Part, Row, cell, exactly
-from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of, worst_word
+from demandops.web.situation import CommitState, Situation, since_of, word_of, worst_word
 
 # ---- who can probably fix a release that is not ready ----
 
@@ -129,10 +129,6 @@ class Cause:
     requesters: tuple[str, ...] = ()
     demands: tuple[str, ...] = ()
 
-    @property
-    def tone(self) -> str:
-        return KINDS[self.kind]
-
     def row(self) -> Row:
         texts = {
             "release": self.releases,
@@ -148,10 +144,6 @@ class Ready:
     application: str
     word: str  # for a health, or the kind of the first cause
     causes: tuple[Cause, ...]
-
-    @property
-    def tone(self) -> str:
-        return {**WORDS, **KINDS}[self.word]
 
 
 def causes(

@@ -39,7 +39,7 @@ from demandops.web import fleet_map, lists, not_ready, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Link, Row, rows_of
 from demandops.web.release_view import explained_demand, explained_release
-from demandops.web.situation import Situation
+from demandops.web.situation import WORDS, Situation
 
 # ---- the views, by address ----
 
@@ -98,8 +98,12 @@ def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
     pending = asked.follower.not_rendered(commit_state)
     causes = not_ready.causes(asked.situation, asked.filter, last_change, pending)
     applications = not_ready.applications(asked.situation, causes, asked.filter)
-    data = {"causes": causes[:_MOST_CAUSES], "total": len(causes), "applications": applications}
-    return "not_ready.html.j2", data
+    return "not_ready.html.j2", {
+        "causes": causes[:_MOST_CAUSES],
+        "total": len(causes),
+        "applications": applications,
+        "tones": {**WORDS, **not_ready.KINDS},
+    }
 
 
 def _list(asked: ViewRequest) -> tuple[str, Data]:
