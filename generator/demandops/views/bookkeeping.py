@@ -7,7 +7,7 @@ whenever it is shown, and is stored nowhere.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from demandops.base.naming import Subject, SubjectKind
@@ -22,54 +22,15 @@ from demandops.model.release import ServiceRelease, claims_of
 from demandops.views import release_causes
 
 # those that the plain data lacks if they are empty
-_LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
+_LEFT_OUT = ("demands", "suspended", "nodes", "waiting", "targets", "listed")
 # Topic → the requesters of the topic, sorted.
 _Requesters: TypeAlias = dict[str, list[str]]
 Json: TypeAlias = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class ServiceEntry:
-    applications: list[str]
-    service: str
-    node: str
-    source: str | None
-    source_topic: str | None
-    version: str  # of the chart
-    application_version: str | None  # in registry/versions.yaml
-    versions_asked: dict[str, list[str]]
-    parameters: dict[str, object]
-    inputs: dict[str, _Requesters]  # by role
-    requesters: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class ConnectionEntry:
-    type: str
-    source: str
-    target: str
-    topics: _Requesters
-    requesters: list[str]
-    # by topic, where they differ: its name at the target, and the ids that demands list it under
-    targets: dict[str, str]
-    listed: dict[str, list[str]]
-
-
-@dataclass(frozen=True, slots=True)
-class Bookkeeping:
-    services: dict[str, ServiceEntry]  # by release name; all mappings are sorted
-    connections: dict[str, ConnectionEntry]
-    # also those whose claims are suspended, but no service or connection counts these claims
-    demands: dict[str, Json]
-    suspended: list[Json]
-    # of those that declare a capacity, what services request of each resource, and the capacity
-    nodes: dict[str, dict[str, Json]]
-    waiting: list[Json]  # in the order of the tries to book
-
-
-def bookkeeping(world: World) -> Bookkeeping:
+def bookkeeping(world: World) -> Json:
     active = without_suspended(world)
-    services, connections = {}, {}
+    services, connections = dict[str, Json](), dict[str, Json]()
     for release in release_causes.releases(world):
         if not isinstance(release, ServiceRelease):
             continue
@@ -81,19 +42,19 @@ def bookkeeping(world: World) -> Bookkeeping:
             for role, topic in demanded_inputs(active, release, claim.application):
                 if topic in inputs[role]:  # a claim that a person wrote may name another topic
                     inputs[role][topic].update(claim.requesters)
-        services[release.name] = ServiceEntry(
-            applications=list(release.applications),
-            service=release.key.service,
-            node=release.node.id,
-            source=release.key.source,
-            source_topic=release.key.topic,
-            version=release.chart.version,
-            application_version=release.version.name or None,
-            versions_asked=release_causes.versions_asked(release, active.ledger),
-            parameters=dict(release.parameters),
-            inputs={role: _sorted(topics) for role, topics in inputs.items()},
-            requesters=list(release.requesters),
-        )
+        services[release.name] = {
+            "applications": list(release.applications),
+            "service": release.key.service,
+            "node": release.node.id,
+            "source": release.key.source,
+            "source_topic": release.key.topic,
+            "version": release.chart.version,
+            "application_version": release.version.name or None,  # in registry/versions.yaml
+            "versions_asked": release_causes.versions_asked(release, active.ledger),
+            "parameters": dict(release.parameters),
+            "inputs": {role: _sorted(topics) for role, topics in inputs.items()},
+            "requesters": list(release.requesters),
+        }
     for id in world.ledger.subjects(SubjectKind.CONNECTION):
         first, claims = active.ledger.connection(id), active.ledger.connection_claims(id)
         if first is None or not claims:
@@ -106,15 +67,17 @@ def bookkeeping(world: World) -> Bookkeeping:
                 requesters[route.source].update(claim.requesters)
                 if route.listed:
                     listed.setdefault(route.source, set()).add(route.listed)
-        connections[id] = ConnectionEntry(
-            type=first.type.word if first.type else "",
-            source=first.source,
-            target=first.target,
-            topics=_sorted(requesters),
-            requesters=list(requesters_of(claims)),
-            targets={r.source: r.target for r in routes if r.source != r.target},
-            listed=_sorted(dict(sorted(listed.items()))),
-        )
+        connections[id] = {
+            "type": first.type.word if first.type else "",
+            "source": first.source,
+            "target": first.target,
+            "topics": _sorted(requesters),
+            "requesters": list(requesters_of(claims)),
+            # by topic, where they differ: its name at the target, and the ids that demands list it
+            # under
+            "targets": {r.source: r.target for r in routes if r.source != r.target},
+            "listed": _sorted(dict(sorted(listed.items()))),
+        }
     suspended = [
         {
             "kind": claim.subject.kind.value[:-1],
@@ -135,9 +98,16 @@ def bookkeeping(world: World) -> Bookkeeping:
         }
         for demand in in_turn(world.ledger.waiting)
     ]
-    services = dict(sorted(services.items()))
-    demands = _demands(world)
-    return Bookkeeping(services, connections, demands, suspended, _nodes(world), waiting)
+    return {
+        "services": dict(sorted(services.items())),  # by release name
+        "connections": connections,
+        # also those whose claims are suspended, but no service or connection counts these claims
+        "demands": _demands(world),
+        "suspended": suspended,
+        # of those that declare a capacity, what services request of each resource, and the capacity
+        "nodes": _nodes(world),
+        "waiting": waiting,  # in the order of the tries to book
+    }
 
 
 def _demands(world: World) -> dict[str, Json]:
@@ -190,7 +160,7 @@ def _sorted(topics: dict[str, set[str]]) -> _Requesters:
     return {topic: sorted(who) for topic, who in topics.items()}
 
 
-def carried_topics(entry: Mapping[str, Any]) -> _Requesters:
+def carried_topics(entry: Json) -> _Requesters:
     """Return the requesters of each topic of a connection, in words such as ``/raw as /points``."""
     targets, listed = entry.get("targets", {}), entry.get("listed", {})
     return {
@@ -201,12 +171,12 @@ def carried_topics(entry: Mapping[str, Any]) -> _Requesters:
     }
 
 
-def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
-    data = asdict(view) | {"commit": commit}
-    for entry in data["connections"].values():
-        for name in ("targets", "listed"):
-            if not entry[name]:
-                del entry[name]
+def as_data(view: Json, commit: str) -> Json:
+    connections = {
+        id: {name: part for name, part in entry.items() if part or name not in _LEFT_OUT}
+        for id, entry in view["connections"].items()
+    }
+    data = view | {"connections": connections, "commit": commit}
     return {name: part for name, part in data.items() if part or name not in _LEFT_OUT}
 
 
@@ -220,58 +190,52 @@ class EntryChange:
     gained: tuple[str, ...] = ()
 
 
-_Entry = ServiceEntry | ConnectionEntry
-
-
 def _changes(
-    kind: Literal["service", "connection"], old: Mapping[str, _Entry], new: Mapping[str, _Entry]
+    kind: Literal["service", "connection"], old: Mapping[str, Json], new: Mapping[str, Json]
 ) -> Iterator[EntryChange]:
     for name in sorted({*old, *new}):
         if name not in new:
-            yield EntryChange(kind, name, "removed", old[name].requesters)
+            yield EntryChange(kind, name, "removed", old[name]["requesters"])
         elif name not in old:
-            yield EntryChange(kind, name, "added", new[name].requesters)
+            yield EntryChange(kind, name, "added", new[name]["requesters"])
         elif old[name] != new[name]:
             had, has = list(_facts(old[name], new[name])), list(_facts(new[name], old[name]))
             lost = tuple(fact for fact in had if fact not in has)
             gained = tuple(fact for fact in has if fact not in had)
-            yield EntryChange(kind, name, "changed", new[name].requesters, lost, gained)
+            yield EntryChange(kind, name, "changed", new[name]["requesters"], lost, gained)
 
 
-def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
+def bookkeeping_changes(old: Json, new: Json) -> tuple[EntryChange, ...]:
     return (
-        *_changes("service", old.services, new.services),
-        *_changes("connection", old.connections, new.connections),
+        *_changes("service", old["services"], new["services"]),
+        *_changes("connection", old["connections"], new["connections"]),
     )
 
 
-def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
-    yield from (f"requester {requester}" for requester in entry.requesters)
-    if isinstance(entry, ConnectionEntry):
-        yield f"from {entry.source} to {entry.target}"
-        yield f"by {entry.type}"
+def _facts(entry: Json, other: Json) -> Iterator[str]:
+    yield from (f"requester {requester}" for requester in entry["requesters"])
+    if "topics" in entry:
+        yield f"from {entry['source']} to {entry['target']}"
+        yield f"by {entry['type']}"
     else:
-        yield f"on {entry.node}"
-        yield from (f"for {application}" for application in entry.applications)
-        yield f"version {entry.version}"
-        if entry.application_version:
-            yield f"application version {entry.application_version}"
-        for version, requesters in entry.versions_asked.items():
+        yield f"on {entry['node']}"
+        yield from (f"for {application}" for application in entry["applications"])
+        yield f"version {entry['version']}"
+        if entry["application_version"]:
+            yield f"application version {entry['application_version']}"
+        for version, requesters in entry["versions_asked"].items():
             yield f"version {version} for {', '.join(requesters)}"
-        yield from (f"{name} = {value}" for name, value in sorted(entry.parameters.items()))
+        yield from (f"{name} = {value}" for name, value in sorted(entry["parameters"].items()))
     others = _topics(other)
     for topic, requesters in sorted(_topics(entry).items()):
         yield topic
         # a requester that ``other`` lacks is not repeated here, because it is a fact above
-        lasting = (who for who in requesters if topic in others and who in other.requesters)
+        lasting = (who for who in requesters if topic in others and who in other["requesters"])
         yield from (f"{topic} for {who}" for who in lasting)
 
 
-def _topics(entry: _Entry) -> _Requesters:
-    if isinstance(entry, ConnectionEntry):
-        inputs = {"topic": carried_topics(asdict(entry))}
-    else:
-        inputs = entry.inputs
+def _topics(entry: Json) -> _Requesters:
+    inputs = {"topic": carried_topics(entry)} if "topics" in entry else entry["inputs"]
     return {
         f"{role} {topic}": requesters
         for role, topics in inputs.items()

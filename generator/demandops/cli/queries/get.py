@@ -192,10 +192,12 @@ class _Connections(Kind):
         return [
             {
                 "name": name,
-                "domains": demand_lists.domains_of([entry.source, entry.target], world.config),
-                **asdict(entry),
+                "domains": demand_lists.domains_of(
+                    [entry["source"], entry["target"]], world.config
+                ),
+                **entry,
             }
-            for name, entry in bookkeeping(world).connections.items()
+            for name, entry in bookkeeping(world)["connections"].items()
         ]
 
 
@@ -390,10 +392,10 @@ class _Services(Kind):
         return [
             {
                 "name": name,
-                "domains": demand_lists.domains_of([service.node], world.config),
-                **asdict(service),
+                "domains": demand_lists.domains_of([service["node"]], world.config),
+                **service,
             }
-            for name, service in bookkeeping(world).services.items()
+            for name, service in bookkeeping(world)["services"].items()
         ]
 
 
