@@ -26,15 +26,10 @@ PAGE = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
-    path: str
-    params: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
 class Part:
     text: str
-    link: Link | None = None
+    view: str = ""  # to which it links, with parameters
+    params: Mapping[str, str] = field(default_factory=dict)
 
 
 Text: TypeAlias = "str | int | Part"
@@ -139,11 +134,11 @@ class ListKind:
 
 
 def _release_part(name: str) -> Part:
-    return Part(name, Link("release", {"name": name}))
+    return Part(name, "release", {"name": name})
 
 
 def _demand_part(id: str) -> Part:
-    return Part(id, Link("demand", {"id": id}))
+    return Part(id, "demand", {"id": id})
 
 
 def _health_cell(word: str) -> Cell:
@@ -151,7 +146,7 @@ def _health_cell(word: str) -> Cell:
 
 
 def _linked(view: str, key: str, values: Iterable[str]) -> Cell:
-    return cell(*(Part(value, Link(view, {"q": exactly(key, value)})) for value in values))
+    return cell(*(Part(value, view, {"q": exactly(key, value)}) for value in values))
 
 
 def _requesters(requesters: Iterable[str]) -> Cell:

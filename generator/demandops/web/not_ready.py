@@ -19,7 +19,7 @@ from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import GENERATOR_NAME
 from demandops.views import release_causes
-from demandops.web.lists import Cell, Filter, Link, Part, Row, cell, exactly
+from demandops.web.lists import Cell, Filter, Part, Row, cell, exactly
 from demandops.web.situation import CommitState, Situation, since_of, word_of, worst_word
 
 # ---- who can probably fix a release that is not ready ----
@@ -260,13 +260,13 @@ def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[
         by_override.setdefault(override.name, (override, []))[1].append(claim)
     for override, suspended in by_override.values():
         names = dict.fromkeys(claim.subject.id for claim in suspended)
-        what = Part(" and ".join(names), Link("overrides"))
+        what = Part(" and ".join(names), "overrides")
         applications = _applications_with(commit_state, suspended)
         yield denial(override, what, "is booked", suspended, applications)
     # the claims that need a denied release are not suspended as a whole
     for release, override in commit_state.denied:
         needing = release_causes.claims_behind(commit_state.active.ledger, release)
-        what = Part(release.description, Link("release", {"name": release.name}))
+        what = Part(release.description, "release", {"name": release.name})
         served = release.applications if isinstance(release, ServiceRelease) else ()
         yield denial(override, what, "is needed", needing, served, (release.name,))
 
@@ -275,7 +275,7 @@ def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
     for waiting in in_turn(now.commit_state.state.ledger.waiting):
         yield Cause(
             "waiting",
-            Part(waiting.demand, Link("demands", {"q": exactly("demand", waiting.demand)})),
+            Part(waiting.demand, "demands", {"q": exactly("demand", waiting.demand)}),
             "waits for room on a node",
             "the generator, as soon as a node has room; the nodes' operator can add room, or a "
             "requester can release something",
@@ -286,7 +286,7 @@ def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
     for proposal in now.proposals:
         yield Cause(
             "decision",
-            Part(proposal.summary, Link("overrides")),
+            Part(proposal.summary, "overrides"),
             "awaits a person's approval",
             "a person who may merge to main",
             "merge the branch to approve the demand, or delete the branch to refuse it",
@@ -341,10 +341,10 @@ def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
     for (word, object, reason, cluster), names in together.items():
         releases = [now.commit_state.releases[name] for name in names]
         first, several = releases[0], len(names) > 1
-        what = Part(first.description, Link("release", {"name": names[0]}))
+        what = Part(first.description, "release", {"name": names[0]})
         if several:
-            link = Link("services", {"q": f"cluster={cluster}"})
-            what = Part(f"{len(names)} releases in {cluster}", link)
+            query = {"q": f"cluster={cluster}"}
+            what = Part(f"{len(names)} releases in {cluster}", "services", query)
         kind: Kind = "failing" if word == "failing" else "starting"
         fail, have, are = ("fail", "have", "are") if several else ("fails", "has", "is")
         why = fail if kind == "failing" else f"{are} starting and not ready yet"

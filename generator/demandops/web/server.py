@@ -37,7 +37,7 @@ from demandops.serve.http_server import HttpServer
 from demandops.views.release_causes import override_state
 from demandops.web import fleet_map, lists, not_ready, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
-from demandops.web.lists import LISTS, Filter, Link, Row, rows_of
+from demandops.web.lists import LISTS, Filter, Part, Row, rows_of
 from demandops.web.release_view import explained_demand, explained_release
 from demandops.web.situation import WORDS, Situation
 
@@ -87,9 +87,9 @@ class ViewRequest:
         query = f"?{urlencode(params)}" if params else ""
         return f"/{self.path if path is None else path}{query}"
 
-    def link(self, link: Link) -> str:
+    def link(self, part: Part) -> str:
         # with its own filter instead of the current one
-        return self.to(link.path, **{"q": "", **link.params})
+        return self.to(part.view, **{"q": "", **part.params})
 
 
 def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
