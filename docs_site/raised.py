@@ -20,7 +20,7 @@ _RAISED = (
     "StateRepoError",
     "RemoteAway",
     "PushDenied",
-    "NoAccess",
+    "NoAnswer",
     "Unsound",
     "QueueFull",
     "ShuttingDown",

@@ -21,7 +21,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.cli import target
 from demandops.cli.changes.override import ends_at
-from demandops.cluster.health import ClusterDomain, ObjectName, health_reader
+from demandops.cluster.health import ClusterDomain, ObjectSelector, health_reader
 from demandops.cluster.health import Target as ReleaseTarget
 from demandops.decide.state import try_configuration
 from demandops.detect import rule_file
@@ -379,7 +379,9 @@ def webhook_address(data: bytes) -> None:
 _OBJECTS = {tuple(one["place"]): one["reported"] for one in _SEEDS["cluster-objects"]}
 _PLACES = (
     ClusterDomain("c-its", "perception", "ns"),
-    ClusterDomain("c-its", "perception", "ns", ObjectName("argocd", "demandops-perception")),
+    ClusterDomain(
+        "c-its", "perception", "ns", ObjectSelector("Application", "argocd", "demandops-perception")
+    ),
 )
 
 

@@ -17,6 +17,7 @@ import yaml
 from demandops.base.runtime import REAL
 from demandops.cli.main import COMMANDS as COMMAND_NAMES
 from demandops.cli.main import cli, load, run
+from demandops.repo.git import child_processes
 
 from tests.kit import plain_yaml
 from tests.kit.goals import EXPERIMENT, put
@@ -46,6 +47,7 @@ def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
     """
     made, clock = count(), [NOW - timedelta(hours=3)]
     patch.setattr(REAL, "now", lambda: clock[0])
+    child_processes.mark()  # the first takes an id, whichever test runs it
     patch.setattr(REAL, "fresh_id", lambda: f"00000000-0000-4000-8000-{next(made):012}")
     patch.chdir(folder)
     patch.setenv("XDG_CONFIG_HOME", str(folder / "config"))

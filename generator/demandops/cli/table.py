@@ -33,6 +33,7 @@ class Column:
     title: str
     rank: int = 0
     wraps: bool = False
+    cell_of: CellOf = str
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,12 +112,10 @@ class Table:
         return max([cell_len(self.columns[at].title), min(natural, _COMFORT), *words])
 
 
-def column(
-    title: str, cell: str | CellOf, rank: int = 0, *, wraps: bool = False
-) -> tuple[Column, CellOf]:
-    """Return a column, and what makes its cells: a function, or the key of a value to show."""
+def column(title: str, cell: str | CellOf, rank: int = 0, *, wraps: bool = False) -> Column:
+    """Return a column; ``cell`` makes its cells, or is the key of a value to show."""
     cell_of = cell if callable(cell) else lambda item, *_: item[cell] or ""
-    return Column(title, rank, wraps), cell_of
+    return Column(title, rank, wraps, cell_of)
 
 
 def joined(key: str) -> CellOf:
@@ -124,13 +123,13 @@ def joined(key: str) -> CellOf:
 
 
 def table_of(
-    columns: Sequence[tuple[Column, CellOf]],
+    columns: Sequence[Column],
     items: Iterable[Any],
     *given: object,
     **more: Any,  # noqa: ANN401 - the other fields of a table
 ) -> Table:
-    rows = [[cell_of(item, *given) for _, cell_of in columns] for item in items]
-    return Table([column for column, _ in columns], rows, **more)
+    rows = [[each.cell_of(item, *given) for each in columns] for item in items]
+    return Table(columns, rows, **more)
 
 
 def _wrapped(lines: Iterable[str], width: int) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -120,6 +120,10 @@ _NO_STATE_REPO = (
 )
 
 
+def with_options(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    return lambda command: reduce(lambda made, option: option(made), reversed(options), command)
+
+
 def _checkout() -> Path | None:
     # `--context` goes before the checkout around the current folder
     named = _NAME in click.get_current_context().meta
@@ -211,7 +215,7 @@ def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Comm
         help=f"The state repo: a bare repository's folder, or a URL that git can clone. Default: "
         f"{where}, otherwise the state repo of the context [env: {_VARIABLE}].",
     )
-    return lambda command: option(_context_option(command))
+    return with_options(option, _context_option)
 
 
 # The option `--state-repo` of a command that only reads; it may name a checkout.
@@ -275,19 +279,18 @@ def names_of(*kinds: str) -> Callable[[click.Context, click.Parameter, str], lis
 def name_options(helps: dict[str, str], **more: Any) -> Callable[[Command], Command]:  # noqa: ANN401
     """Add an option for each name, which a shell completes; one for several is named in plural."""
 
-    def add(command: Command) -> Command:
-        for name, text in reversed(helps.items()):
-            option = click.option(
+    return with_options(
+        *(
+            click.option(
                 f"--{name}",
                 f"{name}s" if more.get("multiple") else name,
                 shell_complete=names_of(f"{name}s"),
                 help=text,
                 **more,
             )
-            command = option(command)
-        return command
-
-    return add
+            for name, text in helps.items()
+        )
+    )
 
 
 def _names(repo: Reader, kind: str) -> Iterator[str]:

@@ -24,10 +24,6 @@ from demandops.model.config.base_model import (
 )
 
 
-class NoAccess(ValueError):
-    """Raised, without a secret in the text, if a controller has no address or kubeconfig."""
-
-
 def _webhook(text: str) -> None:
     addresses.url(text, "https", "http")
 

@@ -22,11 +22,6 @@ State = Literal["waiting", "reconciled", "healthy"]
 _ORDER: dict[str, int] = {"waiting": 0, "pushed": 0, "reconciled": 1, "healthy": 2}
 
 
-class ObjectName(NamedTuple):
-    namespace: str
-    name: str
-
-
 class ObjectSelector(NamedTuple):
     kind: str
     namespace: str
@@ -38,7 +33,7 @@ class ClusterDomain:
     cluster: str
     name: str
     namespace: str
-    application: ObjectName | None = None  # Argo CD's, for the domain's folder; None with Flux
+    application: ObjectSelector | None = None  # Argo CD's, for the domain's folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -339,8 +334,7 @@ class ArgoCd(HealthReader):
     service_kind = "Application"
 
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        folder = ObjectSelector("Application", *_folder_application(domain))
-        return folder, *self.objects_to_confirm(domain)
+        return self.follower(domain), *self.objects_to_confirm(domain)
 
     def domain_health(
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
@@ -361,8 +355,9 @@ class ArgoCd(HealthReader):
             return Health("waiting", reason, name)
         return Health("waiting", message, name, failing=True)
 
-    def follower(self, domain: ClusterDomain) -> Key:
-        return "Application", *_folder_application(domain)
+    def follower(self, domain: ClusterDomain) -> ObjectSelector:
+        assert domain.application is not None  # noqa: S101 - otherwise Flux's reader is used
+        return domain.application
 
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
         app = objects.get(self.follower(domain))
@@ -370,7 +365,7 @@ class ArgoCd(HealthReader):
 
     def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
         annotations = item["metadata"].get("annotations") or {}
-        tracked = f"{_folder_application(domain).name}:"
+        tracked = f"{self.follower(domain).name}:"
         return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
 
     def _service_health(
@@ -415,11 +410,6 @@ class ArgoCd(HealthReader):
         return _error(item)
 
 
-def _folder_application(domain: ClusterDomain) -> ObjectName:
-    assert domain.application is not None  # noqa: S101 - otherwise Flux's reader is used
-    return domain.application
-
-
 def _applied_commits(app: Object) -> list[str]:
     """Return the commits that an Application is known to have applied, the newest first."""
     source = (app.get("spec") or {}).get("source")
@@ -448,7 +438,7 @@ def _why_outdated(
         return "has not been compared yet"
     if not _same((sync.get("comparedTo") or {}).get("source"), source):
         return "has not been compared with its current spec yet"
-    application = objects.get(("Application", *_folder_application(domain))) or {}
+    application = objects.get(ArgoCd().follower(domain)) or {}
     folder = (application.get("spec") or {}).get("source") or {}
     if source.get("repoURL") != folder.get("repoURL"):
         return ""  # the chart is in a registry, and its version is part of the compared source

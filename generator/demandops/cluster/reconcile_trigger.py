@@ -19,7 +19,7 @@ from demandops.base.errors import InvalidInput
 from demandops.base.http_call import NoAnswer
 from demandops.base.runtime import REAL, Runtime
 from demandops.base.settings import MAIN_BRANCH
-from demandops.cluster.clusters_file import ClusterAccess, NoAccess
+from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import REQUESTED_AT, ClusterDomain, Flux, ObjectSelector
 from demandops.cluster.object_cache import object_caches
 from demandops.model.config.config import Config
@@ -52,13 +52,13 @@ def call_argocd(
 
 
 def web_address(repo: str) -> str:
-    """Return the address of a repository's web page; NoAccess is raised if it names no host."""
+    """Return the address of a repository's web page; NoAnswer is raised if it names no host."""
     # Without user and password. Argo CD compares this address with each source's URL by host and
     # path, not by scheme and port.
     parts = urlsplit(repo)
     host, path = in_url(parts.hostname or ""), parts.path.removeprefix("/")
     if not host:
-        raise NoAccess(
+        raise NoAnswer(
             "the state repo's URL names no host, but Argo CD needs a host to recognize the repo; "
             "write https://HOST/PATH or ssh://USER@HOST/PATH in demandops.yaml: argocd.url"
         )
@@ -234,7 +234,7 @@ class ReconcileTrigger:
             wake.handled = {}
             if wake.pause == _FIRST_RETRY_S:
                 # the texts of other errors may have URLs and secrets
-                is_ours = isinstance(error, NoAccess | NoAnswer | InvalidInput)
+                is_ours = isinstance(error, NoAnswer | InvalidInput)
                 log.warning(
                     "cluster '%s' was not woken (%s); retrying for a minute; if no retry succeeds, "
                     "the cluster's controller fetches at its next interval",
@@ -290,7 +290,7 @@ class ReconcileTrigger:
                 )
         else:
             missing = "webhook" if argocd else "receiver"
-            raise NoAccess(f"it has neither a kubeconfig nor a {missing}")
+            raise NoAnswer(f"it has neither a kubeconfig nor a {missing}")
 
 
 def _followed(domains: tuple[AccessDomain, ...]) -> list[ObjectSelector]:

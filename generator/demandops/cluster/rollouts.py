@@ -17,7 +17,7 @@ from demandops.cluster.health import (
     Health,
     History,
     Level,
-    ObjectName,
+    ObjectSelector,
     Target,
     health_reader,
     why_unavailable,
@@ -76,7 +76,8 @@ def domains_of_state(state: State) -> list[ClusterDomain]:
 def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
     application = None  # with Argo CD, the Application that applies the folder of the domain
     if repository.gitops == "argocd" and repository.argocd:
-        application = ObjectName(repository.argocd.namespace, project_of(domain, repository))
+        name = project_of(domain, repository)
+        application = ObjectSelector("Application", repository.argocd.namespace, name)
     return ClusterDomain(cluster, domain.name, domain.namespace, application)
 
 

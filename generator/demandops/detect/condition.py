@@ -1,11 +1,10 @@
-"""What a rule watches for: areas, hours, topics, and the conditions made of them."""
+"""What a rule watches for: patterns of topics, and the conditions on what they report."""
 
 from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
-from datetime import datetime, time, timedelta, tzinfo
+from datetime import datetime, time, timedelta
 from functools import cached_property
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
@@ -16,85 +15,6 @@ from demandops.base.naming import topic_problem
 from demandops.base.quoting import quoted
 from demandops.model.config.base_model import CamelModel, DnsLabel, Positive, readable_by, without
 from demandops.model.config.inventory import Position
-
-# ---- areas of the map: a point or a polygon, and how far a position is from it ----
-
-# x and y in metres, in the map frame of the positions.
-Point = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Area:
-    """A point, or a polygon of at least three corners; an edge joins its last and first corner."""
-
-    corners: tuple[Point, ...]
-
-    @cached_property
-    def bounds(self) -> tuple[float, float, float, float]:
-        xs, ys = zip(*self.corners, strict=True)
-        return min(xs), min(ys), max(xs), max(ys)
-
-    def distance(self, x: float, y: float) -> float:
-        """Return the metres from a position to the area; 0 inside a polygon and on its edge."""
-        if len(self.corners) == 1:
-            ((at_x, at_y),) = self.corners
-            return math.hypot(x - at_x, y - at_y)
-        edges = zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True)
-        nearest, inside = math.inf, False
-        for (x1, y1), (x2, y2) in edges:
-            along_x, along_y = x2 - x1, y2 - y1
-            length = along_x * along_x + along_y * along_y
-            share = ((x - x1) * along_x + (y - y1) * along_y) / length if length else 0.0
-            share = min(1.0, max(0.0, share))
-            to_edge = math.hypot(x - x1 - share * along_x, y - y1 - share * along_y)
-            nearest = min(nearest, to_edge)
-            # each edge that a ray to the right crosses swaps inside and outside
-            if (y1 > y) != (y2 > y) and x < x1 + (y - y1) / (y2 - y1) * (x2 - x1):
-                inside = not inside
-        return 0.0 if inside else nearest
-
-
-# ---- schedules: the days and hours at which a rule's demand is wanted ----
-
-Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
-DAYS: tuple[Day, ...] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
-
-
-@dataclass(frozen=True, slots=True)
-class Schedule:
-    """A span of hours on certain days of the week.
-
-    If ``end`` is before ``start``, the span lasts past midnight. ``days`` are the days on which a
-    span starts, as numbers; Monday is 0.
-    """
-
-    days: frozenset[int]
-    start: time
-    end: time
-    zone: tzinfo
-
-    def is_on(self, now: float) -> bool:
-        local = datetime.fromtimestamp(now, self.zone)
-        clock, today = local.time(), local.weekday()
-        if self.start < self.end:
-            return today in self.days and self.start <= clock < self.end
-        yesterday = (today - 1) % 7
-        return (today in self.days and clock >= self.start) or (
-            yesterday in self.days and clock < self.end
-        )
-
-    def next_check(self, now: float) -> float:
-        """Return the time after ``now`` at which to call :meth:`is_on` again."""
-        local = datetime.fromtimestamp(now, self.zone)
-        # The result of :meth:`is_on` changes at a start, at an end, and if summer time begins or
-        # ends. To notice the latter soon, an hour is the longest time.
-        dates = (local.date(), local.date() + timedelta(days=1))
-        moments = [
-            datetime.combine(day, at, self.zone) for day in dates for at in (self.start, self.end)
-        ]
-        ahead = (now + 3600.0, *(moment.timestamp() for moment in moments))
-        return min(moment for moment in ahead if moment > now)
-
 
 # ---- patterns of topics, such as ``/vehicles/{entity}/pose`` ----
 
@@ -140,6 +60,10 @@ Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 Metres = Annotated[float, Field(ge=0, le=1e6)]
 
 
+# x and y in metres, in the map frame of the positions.
+Point = tuple[float, float]
+
+
 class _InArea(CamelModel):
     """A condition on the distance to a point or a polygon."""
 
@@ -153,19 +77,45 @@ class _InArea(CamelModel):
             raise ValueError("needs exactly one of point and polygon")
         return self
 
-    @property
-    def area(self) -> Area:
+    @cached_property
+    def corners(self) -> tuple[Point, ...]:
+        # one, or at least three; an edge joins the last and the first
         corners = self.polygon or ((self.point,) if self.point else ())
-        return Area(tuple((corner.x, corner.y) for corner in corners))
+        return tuple((corner.x, corner.y) for corner in corners)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        xs, ys = zip(*self.corners, strict=True)
+        return min(xs), min(ys), max(xs), max(ys)
+
+    def distance(self, x: float, y: float) -> float:
+        """Return the metres from a position to the area; 0 inside a polygon and on its edge."""
+        if len(self.corners) == 1:
+            ((at_x, at_y),) = self.corners
+            return math.hypot(x - at_x, y - at_y)
+        edges = zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True)
+        nearest, inside = math.inf, False
+        for (x1, y1), (x2, y2) in edges:
+            along_x, along_y = x2 - x1, y2 - y1
+            length = along_x * along_x + along_y * along_y
+            share = ((x - x1) * along_x + (y - y1) * along_y) / length if length else 0.0
+            share = min(1.0, max(0.0, share))
+            to_edge = math.hypot(x - x1 - share * along_x, y - y1 - share * along_y)
+            nearest = min(nearest, to_edge)
+            # each edge that a ray to the right crosses swaps inside and outside
+            if (y1 > y) != (y2 > y) and x < x1 + (y - y1) / (y2 - y1) * (x2 - x1):
+                inside = not inside
+        return 0.0 if inside else nearest
 
 
-def _refuse_distances(start: float, stop: float) -> None:
-    if stop <= start:
+def _refuse_distances(limits: Any) -> Any:  # noqa: ANN401 - one of the two conditions
+    if limits.stop <= limits.start:
         raise ValueError(
-            f"'stop' is {stop:g}, but must be more than 'start', which is {start:g}: between the "
-            "two, the condition stays as it is, so that an entity near the limit does not start "
-            "and stop it again and again"
+            f"'stop' is {limits.stop:g}, but must be more than 'start', which is "
+            f"{limits.start:g}: between the two, the condition stays as it is, so that an entity "
+            "near the limit does not start and stop it again and again"
         )
+    return limits
 
 
 class Near(_InArea):
@@ -177,10 +127,7 @@ class Near(_InArea):
     start: Metres
     stop: Metres
 
-    @model_validator(mode="after")
-    def _has_hysteresis(self) -> Near:
-        _refuse_distances(self.start, self.stop)
-        return self
+    _has_hysteresis = model_validator(mode="after")(_refuse_distances)
 
 
 class Together(CamelModel):
@@ -196,10 +143,7 @@ class Together(CamelModel):
     start: Metres
     stop: Annotated[float, Field(ge=0.01, le=1e6)]
 
-    @model_validator(mode="after")
-    def _has_hysteresis(self) -> Together:
-        _refuse_distances(self.start, self.stop)
-        return self
+    _has_hysteresis = model_validator(mode="after")(_refuse_distances)
 
 
 class Count(_InArea):
@@ -267,6 +211,10 @@ def _zone(text: str) -> ZoneInfo:
         raise ValueError(f"'{text}' is not a time zone; write it like Europe/Berlin") from None
 
 
+Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
+DAYS: tuple[Day, ...] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+
+
 class Hours(CamelModel):
     """A condition that holds from one time of day to another, on certain days of the week."""
 
@@ -283,7 +231,26 @@ class Hours(CamelModel):
             raise ValueError("must differ from start")
         return stop
 
-    @property
-    def schedule(self) -> Schedule:
-        days = frozenset(DAYS.index(day) for day in self.days)
-        return Schedule(days, _clock(self.start), _clock(self.stop), _zone(self.zone))
+    def is_on(self, now: float) -> bool:
+        start, end = _clock(self.start), _clock(self.stop)
+        local = datetime.fromtimestamp(now, _zone(self.zone))
+        clock, weekday = local.time(), local.weekday()
+        # the days are those on which a span starts, which may last past midnight
+        today, yesterday = DAYS[weekday] in self.days, DAYS[weekday - 1] in self.days
+        if start < end:
+            return today and start <= clock < end
+        return (today and clock >= start) or (yesterday and clock < end)
+
+    def next_check(self, now: float) -> float:
+        """Return the time after ``now`` at which to call :meth:`is_on` again."""
+        zone = _zone(self.zone)
+        today = datetime.fromtimestamp(now, zone).date()
+        # The result of :meth:`is_on` changes at a start, at an end, and if summer time begins or
+        # ends. To notice the latter soon, an hour is the longest time.
+        moments = [
+            datetime.combine(day, _clock(at), zone)
+            for day in (today, today + timedelta(days=1))
+            for at in (self.start, self.stop)
+        ]
+        ahead = (now + 3600.0, *(moment.timestamp() for moment in moments))
+        return min(moment for moment in ahead if moment > now)

@@ -18,12 +18,12 @@ from demandops.model.config.base_model import seconds_of
 
 def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, Goal]:
     """Return each booked or waiting event, with a goal that can end its demand."""
-    demands = []
+    demands: list[BookedDemand] = []
     for id, entry in bookkeeping.get("demands", {}).items():
-        own_id = id if entry["action"] == "Demand" else ""
-        demands.append(BookedDemand(own_id, entry["request"], tuple(entry["requesters"])))
+        own_id = id if entry["action"] == "Demand" else entry["request"]
+        demands.append((entry["action"], own_id, entry["requesters"]))
     for entry in bookkeeping.get("waiting", ()):
-        demands.append(BookedDemand(entry["demand"], "", tuple(entry["requesters"])))
+        demands.append(("Demand", entry["demand"], entry["requesters"]))
     goals: dict[Key, Goal] = {}
     for demand in demands:
         for rule in file.rules:
@@ -89,7 +89,7 @@ class Detector:
             goal = None
             if event.starts:
                 self._values[event.key] = event.values
-                goal = self._rules[event.rule].template.goal(event.values)
+                goal = self._rules[event.rule].template.filled(event.values)
             else:
                 self._values.pop(event.key, None)
             wants.append((event, self._want(event.key, goal)))
@@ -123,7 +123,7 @@ class Detector:
                 # After a restart, the values at the start of an event are not known, for example
                 # ``distance``. An event whose new demand needs such a value keeps the old one.
                 if rule.template.names() <= set(values):
-                    changed.append(self._want(key, rule.template.goal(values)))
+                    changed.append(self._want(key, rule.template.filled(values)))
         return changed
 
     def _want(self, key: Key, goal: Goal | None) -> Want:
@@ -194,7 +194,7 @@ class _Entry:
             is_replaced = wanted is not None and (
                 wanted == held
                 or (
-                    wanted.action == held.action == "demand"
+                    wanted.action == held.action == "Demand"
                     and (wanted.id, wanted.requesters) == (held.id, held.requesters)
                 )
             )
@@ -254,7 +254,7 @@ class WantedDemands:
         # After a rule is renamed, an event of the old name and an event of the new name may want
         # demands with the same id. The second then waits until the first has ended its demand.
         # A ``DeploymentRequest`` has no demand id, so there is nothing to reserve.
-        return goal.action != "demand" or self._owners.setdefault(goal.id, key) == key
+        return goal.action != "Demand" or self._owners.setdefault(goal.id, key) == key
 
     def next_at(self) -> float:
         """Return when to call :meth:`next` again, unless another call here comes first."""

@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
-from dataclasses import replace
 from fnmatch import translate
 from functools import partial
 from math import floor, hypot, inf
 from statistics import median
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any
 
-from demandops.detect.condition import Area, Count, Hours, Near, Threshold, Together
+from demandops.detect.condition import Count, Hours, Near, Threshold, Together
 from demandops.detect.observations import Cell, Event, Key, Observation, Phase, State, Who
 from demandops.detect.rule_file import Rule, RuleFile, Values
 from demandops.model.config.base_model import seconds_of
@@ -23,11 +22,8 @@ from demandops.model.config.base_model import seconds_of
 Seen = Mapping[Who, Observation]
 
 
-class Facts(NamedTuple):
-    """The values of an event for the rule's template, and the event's cause in words for people."""
-
-    values: Values
-    text: str
+# The values of an event for the rule's template, and the event's cause in words for people.
+Facts = tuple[Values, str]
 
 
 class CompiledRule:
@@ -58,10 +54,10 @@ class CompiledRule:
 class HoursRule(CompiledRule):
     def __init__(self, rule: Rule, hours: Hours) -> None:
         super().__init__(rule)
-        self.schedule = hours.schedule
+        self.hours = hours
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        return Facts(self._named(subjects), "the hours of the schedule")
+        return self._named(subjects), "the hours of the schedule"
 
 
 class ThresholdRule(CompiledRule):
@@ -80,7 +76,7 @@ class ThresholdRule(CompiledRule):
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
         value = seen[self.sources[0], subjects[0]].values.get(self.field, 0.0)
         named = {**self._named(subjects), "value": value}
-        return Facts(named, f"{self.field} of {subjects[0]} is {value:g}")
+        return named, f"{self.field} of {subjects[0]} is {value:g}"
 
 
 class AreaRule(CompiledRule):
@@ -88,7 +84,7 @@ class AreaRule(CompiledRule):
 
     def __init__(self, rule: Rule, condition: Near | Count) -> None:
         super().__init__(rule)
-        self.area = condition.area
+        self.area = condition
         self.count = condition if isinstance(condition, Count) else None
         self.start: float = condition.radius if isinstance(condition, Count) else condition.start
         self.stop: float = condition.radius if isinstance(condition, Count) else condition.stop
@@ -96,11 +92,11 @@ class AreaRule(CompiledRule):
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
         named = self._named(subjects)
         if self.count is not None:
-            return Facts({**named, "count": count}, f"{count} entities are in or near the area")
+            return {**named, "count": count}, f"{count} entities are in or near the area"
         x, y = seen[self.sources[0], subjects[0]].position or (0.0, 0.0)
         distance = self.area.distance(x, y)
         text = f"{subjects[0]} is {distance:.1f} m from the area"
-        return Facts({**named, "x": x, "y": y, "distance": distance}, text)
+        return {**named, "x": x, "y": y, "distance": distance}, text
 
 
 class PairRule(CompiledRule):
@@ -127,7 +123,7 @@ class PairRule(CompiledRule):
         last, other = (seen[who] for who in self.entities_of(subjects))
         (x, y), away = last.position or (0.0, 0.0), distance(last, other)
         text = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
-        return Facts({**self._named(subjects), "x": x, "y": y, "distance": away}, text)
+        return {**self._named(subjects), "x": x, "y": y, "distance": away}, text
 
     def _cell(self, observation: Observation | None) -> Cell | None:
         if observation is None or observation.position is None:
@@ -172,53 +168,48 @@ def distance(last: Observation, other: Observation) -> float:
     return hypot(last.position[0] - other.position[0], last.position[1] - other.position[1])
 
 
-def compiled(rule: Rule) -> CompiledRule:
-    condition = rule.condition
-    if isinstance(condition, Near | Count):
-        return AreaRule(rule, condition)
-    if isinstance(condition, Together):
-        return PairRule(rule, condition)
-    if isinstance(condition, Threshold):
-        return ThresholdRule(rule, condition)
-    return HoursRule(rule, condition)
+_COMPILED: Mapping[type, Callable[[Rule, Any], CompiledRule]] = {
+    Near: AreaRule,
+    Count: AreaRule,
+    Together: PairRule,
+    Threshold: ThresholdRule,
+    Hours: HoursRule,
+}
 
 
 # ---- an index of areas by position, so that an entity is compared only with those near it ----
-
-Item = TypeVar("Item")
 
 _SMALLEST_CELL_M = 10.0
 # How many squares an area in the index may touch. A larger area is compared with every entity.
 _MOST_CELLS = 4096
 
 
-class AreaGrid(Generic[Item]):
-    """Items with areas, indexed by the squares of the map that each area and its margin touch."""
+class AreaGrid:
+    """Rules on areas, indexed by the squares of the map that each area and its margin touch."""
 
-    def __init__(self, items: Iterable[tuple[Item, Area, float]]) -> None:
-        # (item, area, margin around the area in metres)
-        boxes: list[tuple[Item, tuple[float, float, float, float]]] = []
-        for item, area, around in items:
-            low_x, low_y, high_x, high_y = area.bounds
-            boxes.append((item, (low_x - around, low_y - around, high_x + around, high_y + around)))
+    def __init__(self, rules: Iterable[AreaRule]) -> None:
+        boxes: list[tuple[AreaRule, tuple[float, float, float, float]]] = []
+        for rule in rules:
+            (low_x, low_y, high_x, high_y), around = rule.area.bounds, rule.stop
+            boxes.append((rule, (low_x - around, low_y - around, high_x + around, high_y + around)))
         # With squares as wide as a usual area, an area touches few squares and a square few areas.
         sizes = [max(box[2] - box[0], box[3] - box[1]) for _, box in boxes]
         self._size = max(_SMALLEST_CELL_M, median(sizes) if sizes else 0.0)
-        cells = defaultdict[tuple[int, int], list[Item]](list)
-        large: list[Item] = []
-        for item, box in boxes:
+        cells = defaultdict[tuple[int, int], list[AreaRule]](list)
+        large: list[AreaRule] = []
+        for rule, box in boxes:
             left, bottom, right, top = (floor(edge / self._size) for edge in box)
             if (right - left + 1) * (top - bottom + 1) > _MOST_CELLS:
-                large.append(item)
+                large.append(rule)
                 continue
             for x in range(left, right + 1):
                 for y in range(bottom, top + 1):
-                    cells[x, y].append(item)
+                    cells[x, y].append(rule)
         self._large = tuple(large)
         self._cells = {cell: (*large, *inside) for cell, inside in cells.items()}
 
-    def at(self, x: float, y: float) -> Sequence[Item]:
-        # a superset of the items whose area or margin contains the position
+    def at(self, x: float, y: float) -> Sequence[AreaRule]:
+        # a superset of the rules whose area or margin contains the position
         return self._cells.get((floor(x / self._size), floor(y / self._size)), self._large)
 
 
@@ -241,7 +232,8 @@ class EventEngine:
         self.pairs: dict[str, list[PairRule]] = {name: [] for name in file.sources}
         areas = defaultdict[str, list[AreaRule]](list)
         for each in file.rules:
-            rule = self.rules[each.name] = compiled(each)
+            rule = _COMPILED[type(each.condition)](each, each.condition)
+            self.rules[each.name] = rule
             for source in dict.fromkeys(rule.sources):
                 if isinstance(rule, AreaRule):
                     areas[source].append(rule)
@@ -251,10 +243,7 @@ class EventEngine:
                     self.thresholds[source].append(rule)
             if isinstance(rule, HoursRule):
                 self.hours.append(rule)
-        self.areas = {
-            name: AreaGrid((rule, rule.area, rule.stop) for rule in areas[name])
-            for name in file.sources
-        }
+        self.areas = {name: AreaGrid(areas[name]) for name in file.sources}
 
     def start(self, now: float, held: Iterable[Key] = (), settle_s: float = 0.0) -> State:
         """Return the state with which the engine starts.
@@ -272,7 +261,7 @@ class EventEngine:
         step = EngineStep(self, State(now, due=-inf, settled=now + settle, hours_due=now))
         for key in keys:
             step.resume(key, settle_s)
-        return step.result()
+        return step.state
 
     def step(
         self, state: State, observations: Iterable[Observation], now: float
@@ -289,7 +278,7 @@ class EventEngine:
                 step.pass_time(min(observation.at, now))
                 step.observe(observation)
         step.pass_time(now)
-        return step.result(), tuple(step.events)
+        return step.state, tuple(step.events)
 
 
 # ---- one step of the engine, which changes a copy of the state ----
@@ -297,30 +286,8 @@ class EventEngine:
 
 class EngineStep:
     def __init__(self, engine: EventEngine, state: State) -> None:
-        # The copies cost little: one step takes many observations, and the values in the mappings
-        # are immutable, so they are not copied.
-        self._engine, self._before = engine, state
-        self._now, self._due, self._hours_due = state.now, state.due, state.hours_due
-        self._seen, self._awaited = dict(state.seen), dict(state.awaited)
-        self._phases, self._engaged = dict(state.phases), dict(state.engaged)
-        self._counted, self._counts = dict(state.counted), dict(state.counts)
-        self._cells = dict(state.cells)
+        self._engine, self.state = engine, state.copied()
         self.events: list[Event] = []
-
-    def result(self) -> State:
-        return replace(
-            self._before,
-            now=self._now,
-            due=self._due,
-            hours_due=self._hours_due,
-            seen=self._seen,
-            awaited=self._awaited,
-            phases=self._phases,
-            engaged=self._engaged,
-            counted=self._counted,
-            counts=self._counts,
-            cells=self._cells,
-        )
 
     def resume(self, key: Key, settle_s: float) -> None:
         # An event that started before a restart; one that no rule is for is ignored.
@@ -329,83 +296,86 @@ class EngineStep:
             return
         entities = rule.entities_of(key[1])
         if all(map(rule.takes, entities)):
-            self._enter(key, rule, Phase(self._now, lasts=True))
+            self._enter(key, rule, Phase(self.state.now, lasts=True))
             for who in entities:
                 # A source that reports seldom may not have reported yet when the detector settles.
                 wait_s = max(settle_s, self._engine.timeouts[who[0]])
-                self._awaited[who] = self._before.now + wait_s
+                self.state.awaited[who] = self.state.now + wait_s
 
     # ---- time ----
 
     def pass_time(self, until: float) -> None:
-        while until >= self._due:
-            self._due = inf
+        while until >= self.state.due:
+            self.state.due = inf
             # In the order of their times, so a long silence gives the same events as short ones.
             for at, act in sorted(self._all_due(), key=lambda due: due[0]):
-                if at > min(until, self._due):  # an action may have made another change due before
+                # an action may have made another change due before
+                if at > min(until, self.state.due):
                     break
-                self._now = max(self._now, at)
+                self.state.now = max(self.state.now, at)
                 act()
-            self._due = min((at for at, _ in self._all_due()), default=inf)
-        self._now = max(self._now, until)
+            self.state.due = min((at for at, _ in self._all_due()), default=inf)
+        self.state.now = max(self.state.now, until)
 
     def _all_due(self) -> Iterator[tuple[float, Callable[[], None]]]:
-        for key, phase in self._phases.items():
+        for key, phase in self.state.phases.items():
             if not phase.lasts:
                 at = phase.since + self._engine.rules[key[0]].dwell
                 yield at, partial(self._end_dwell, key, phase)
         if self._engine.hours:
-            yield self._hours_due, self._look_at_hours
-        if self._now < self._before.settled:
+            yield self.state.hours_due, self._look_at_hours
+        if self.state.now < self.state.settled:
             for rule in self._engine.rules.values():
                 if isinstance(rule, AreaRule):
-                    yield self._before.settled, partial(self._latch_count, rule)
+                    yield self.state.settled, partial(self._latch_count, rule)
         timeouts = self._engine.timeouts
-        for who, last in self._seen.items():
+        for who, last in self.state.seen.items():
             yield last.at + timeouts[last.source], partial(self._lose_silent, who, last)
-        for who, until in self._awaited.items():
+        for who, until in self.state.awaited.items():
             yield until, partial(self._lose_awaited, who)
 
     def _end_dwell(self, key: Key, phase: Phase) -> None:
         # An action before this one may have ended the phase, or begun another.
-        if self._phases.get(key) is phase:
+        if self.state.phases.get(key) is phase:
             self._begin(key, self._engine.rules[key[0]])
 
     def _look_at_hours(self) -> None:
         for rule in self._engine.hours:
-            is_on = rule.schedule.is_on(self._now)
+            is_on = rule.hours.is_on(self.state.now)
             self._latch((rule.name, ()), rule, is_on, not is_on)
-        self._hours_due = min(rule.schedule.next_check(self._now) for rule in self._engine.hours)
-        self._due = min(self._due, self._hours_due)
+        self.state.hours_due = min(
+            rule.hours.next_check(self.state.now) for rule in self._engine.hours
+        )
+        self.state.due = min(self.state.due, self.state.hours_due)
 
     def _lose_silent(self, who: Who, last: Observation) -> None:
-        if self._seen.get(who) is last:
+        if self.state.seen.get(who) is last:
             self._lose(who, f"{who[1]} has been silent for {self._engine.timeouts[who[0]]:g} s")
 
     def _lose_awaited(self, who: Who) -> None:
-        if self._awaited.pop(who, None) is not None:
+        if self.state.awaited.pop(who, None) is not None:
             self._lose(who, f"{who[1]} has not been seen since the start")
 
     def _lose(self, who: Who, why: str) -> None:
-        last = self._seen.pop(who, None)
-        for key in sorted(self._engaged.get(who, ())):
+        last = self.state.seen.pop(who, None)
+        for key in sorted(self.state.engaged.get(who, ())):
             self._leave(key, self._engine.rules[key[0]], why)
-        for name in sorted(self._counted.pop(who, ())):
+        for name in sorted(self.state.counted.pop(who, ())):
             self._count(name, -1)
         for pair in self._engine.pairs[who[0]]:
             if pair.takes(who):
-                pair.move(self._cells, who[1], last, None)
+                pair.move(self.state.cells, who[1], last, None)
 
     # ---- observations ----
 
     def observe(self, observation: Observation) -> None:
-        if observation.at != self._now:
-            observation = observation._replace(at=self._now)
+        if observation.at != self.state.now:
+            observation = observation._replace(at=self.state.now)
         who, source, entity = observation.who, observation.source, observation.entity
-        before = self._seen.get(who)
-        self._seen[who] = observation
-        self._awaited.pop(who, None)
-        self._due = min(self._due, observation.at + self._engine.timeouts[source])
+        before = self.state.seen.get(who)
+        self.state.seen[who] = observation
+        self.state.awaited.pop(who, None)
+        self.state.due = min(self.state.due, observation.at + self._engine.timeouts[source])
         for rule in self._engine.thresholds[source]:
             value = observation.values.get(rule.field)
             if value is not None and rule.is_for(entity):
@@ -415,7 +385,7 @@ class EngineStep:
             self._compare_with_areas(observation, *observation.position)
             for pair in self._engine.pairs[source]:
                 if pair.takes(who):
-                    pair.move(self._cells, entity, before, observation)
+                    pair.move(self.state.cells, entity, before, observation)
                     self._compare_with_others(pair, observation)
 
     def _compare_with_areas(self, observation: Observation, x: float, y: float) -> None:
@@ -432,75 +402,75 @@ class EngineStep:
             elif away <= rule.start:
                 counted.add(rule.name)
         # The index does not yield the areas that the entity has left, so their events end here.
-        for key in sorted(self._engaged.get(who, ())):
+        for key in sorted(self.state.engaged.get(who, ())):
             left = self._engine.rules[key[0]]
             if isinstance(left, AreaRule) and key[0] not in compared:
                 self._latch(key, left, False, True)
-        before = self._counted.get(who, frozenset())
+        before = self.state.counted.get(who, frozenset())
         if counted != before:
-            self._counted[who] = frozenset(counted)
+            self.state.counted[who] = frozenset(counted)
             for name in sorted(counted ^ before):
                 self._count(name, 1 if name in counted else -1)
 
     def _compare_with_others(self, rule: PairRule, observation: Observation) -> None:
         who, compared = observation.who, set[Key]()
-        for other in sorted(rule.around(self._cells, observation)):
-            key, away = rule.key(who, other), distance(observation, self._seen[other])
+        for other in sorted(rule.around(self.state.cells, observation)):
+            key, away = rule.key(who, other), distance(observation, self.state.seen[other])
             compared.add(key)
             self._latch(key, rule, away <= rule.start, away > rule.stop)
         # The squares around do not have the partners that are far away, so their events end here. A
         # partner that is still awaited after a restart has no position yet.
-        for key in sorted(self._engaged.get(who, ())):
+        for key in sorted(self.state.engaged.get(who, ())):
             is_left = key[0] == rule.name and key not in compared
-            if is_left and all(entity in self._seen for entity in rule.entities_of(key[1])):
+            if is_left and all(entity in self.state.seen for entity in rule.entities_of(key[1])):
                 self._latch(key, rule, False, True)
 
     def _count(self, name: str, change: int) -> None:
         rule = self._engine.rules[name]
-        self._counts[name] = self._counts.get(name, 0) + change
+        self.state.counts[name] = self.state.counts.get(name, 0) + change
         if isinstance(rule, AreaRule):
             self._latch_count(rule)
 
     def _latch_count(self, rule: AreaRule) -> None:
-        count = self._counts.get(rule.name, 0)
+        count = self.state.counts.get(rule.name, 0)
         if rule.count is not None:
-            stops = count <= rule.count.stop and self._now >= self._before.settled
+            stops = count <= rule.count.stop and self.state.now >= self.state.settled
             self._latch((rule.name, ()), rule, count >= rule.count.start, stops)
 
     # ---- events ----
 
     def _latch(self, key: Key, rule: CompiledRule, starts: bool, stops: bool) -> None:
-        phase = self._phases.get(key)
+        phase = self.state.phases.get(key)
         if stops and phase is not None:
             self._leave(key, rule, "")
         elif starts and phase is None:
             if rule.dwell:
-                self._enter(key, rule, Phase(self._now, lasts=False))
-                self._due = min(self._due, self._now + rule.dwell)
+                self._enter(key, rule, Phase(self.state.now, lasts=False))
+                self.state.due = min(self.state.due, self.state.now + rule.dwell)
             else:
                 self._begin(key, rule)
 
     def _begin(self, key: Key, rule: CompiledRule) -> None:
-        self._enter(key, rule, Phase(self._now, lasts=True))
+        self._enter(key, rule, Phase(self.state.now, lasts=True))
         self._report(key, rule, True, "")
 
     def _enter(self, key: Key, rule: CompiledRule, phase: Phase) -> None:
-        self._phases[key] = phase
+        self.state.phases[key] = phase
         for who in rule.entities_of(key[1]):
-            self._engaged[who] = self._engaged.get(who, frozenset()) | {key}
+            self.state.engaged[who] = self.state.engaged.get(who, frozenset()) | {key}
 
     def _leave(self, key: Key, rule: CompiledRule, why: str) -> None:
-        phase = self._phases.pop(key)
+        phase = self.state.phases.pop(key)
         for who in rule.entities_of(key[1]):
-            self._engaged[who] -= {key}
-            if not self._engaged[who]:
-                del self._engaged[who]
+            self.state.engaged[who] -= {key}
+            if not self.state.engaged[who]:
+                del self.state.engaged[who]
         if phase.lasts:
             self._report(key, rule, False, why)
 
     def _report(self, key: Key, rule: CompiledRule, starts: bool, why: str) -> None:
         if why:
-            self.events.append(Event(*key, starts, self._now, why))
+            self.events.append(Event(*key, starts, self.state.now, why))
         else:
-            facts = rule.facts(key[1], self._seen, self._counts.get(key[0], 0))
-            self.events.append(Event(*key, starts, self._now, facts.text, facts.values))
+            values, cause = rule.facts(key[1], self.state.seen, self.state.counts.get(key[0], 0))
+            self.events.append(Event(*key, starts, self.state.now, cause, values))

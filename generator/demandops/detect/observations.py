@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass, field, fields, replace
 from math import isfinite
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
@@ -61,7 +62,7 @@ class Phase(NamedTuple):
     lasts: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class State:
     """The engine's whole state; times are in seconds since 1970."""
 
@@ -74,20 +75,26 @@ class State:
     # The time at which the schedules are checked next.
     hours_due: float
     # The last observation of each entity that is not gone.
-    seen: Mapping[Who, Observation] = field(default_factory=dict)
+    seen: dict[Who, Observation] = field(default_factory=dict)
     # The entities of resumed events that have not been seen since the engine started. Each has the
     # time at which it counts as gone.
-    awaited: Mapping[Who, float] = field(default_factory=dict)
+    awaited: dict[Who, float] = field(default_factory=dict)
     # The phases that have not ended.
-    phases: Mapping[Key, Phase] = field(default_factory=dict)
+    phases: dict[Key, Phase] = field(default_factory=dict)
     # For each entity, the keys of the phases in which the entity takes part.
-    engaged: Mapping[Who, frozenset[Key]] = field(default_factory=dict)
+    engaged: dict[Who, frozenset[Key]] = field(default_factory=dict)
     # For each entity, the names of the rules with a count in whose radius the entity is.
-    counted: Mapping[Who, frozenset[str]] = field(default_factory=dict)
+    counted: dict[Who, frozenset[str]] = field(default_factory=dict)
     # How many entities a rule counts, by the name of the rule.
-    counts: Mapping[str, int] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
     # The entities in each square, for rules on pairs.
-    cells: Mapping[Cell, frozenset[str]] = field(default_factory=dict)
+    cells: dict[Cell, frozenset[str]] = field(default_factory=dict)
+
+    def copied(self) -> State:
+        # The values in the mappings are immutable. The copies cost little, because one step takes
+        # many observations.
+        own: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        return State(**{name: copy(value) for name, value in own.items()})
 
     @property
     def lasting(self) -> frozenset[Key]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Annotated, Any, Literal
@@ -108,63 +108,51 @@ def candidates(template: str, text: str) -> Mapping[str, str]:
 # The template also recognizes which demands in the bookkeeping the rule has made, so that a restart
 # of the detector changes nothing.
 
-Action = Literal["demand", "deployment_request"]
+# the names of the ROS actions
+Action = Literal["Demand", "DeploymentRequest"]
 # What a goal of ``Demand`` also has in a file.
 _HEAD = {"apiVersion": API_VERSION, "kind": "Demand"}
 
 
+# A demand in the bookkeeping: its action, its id there, and its requesters.
+BookedDemand = tuple[Action, str, Sequence[str]]
+
+
 @dataclass(frozen=True, slots=True)
 class Goal:
+    """A goal, or a rule's template for goals, whose texts have names in braces."""
+
     action: Action
     data: Mapping[str, Any]
 
     @property
     def id(self) -> str:
-        return str(self.data["demand" if self.action == "demand" else "id"])
+        return str(self.data.get("demand" if self.action == "Demand" else "id", ""))
 
     @property
     def requesters(self) -> tuple[str, ...]:
-        return tuple(sorted({*requesters_in(self.action, self.data)}))
-
-    @property
-    def action_name(self) -> str:
-        return "Demand" if self.action == "demand" else "DeploymentRequest"
+        lists = requester_lists(self.action, self.data)
+        return tuple(sorted({id for _, ids in lists for id in ids}))
 
     @property
     def document(self) -> Mapping[str, Any]:
         """The goal in the form that a file for ``demandops request`` has."""
-        return {**_HEAD, **self.data} if self.action == "demand" else self.data
+        return {**_HEAD, **self.data} if self.action == "Demand" else self.data
 
     def ended(self) -> Goal:
-        if self.action == "deployment_request":
+        if self.action == "DeploymentRequest":
             return Goal(self.action, {**self.data, "shutdown": True})
-        return Goal(self.action, {**_identity(self.data), "operation": "release"})
+        return Goal(self.action, {**self._identity(), "operation": "release"})
 
     def renewed(self) -> Goal:
-        if self.action == "deployment_request":
+        if self.action == "DeploymentRequest":
             return self  # the same request again renews the leases of its claims
-        return Goal(self.action, {**_identity(self.data), "operation": "renew"})
+        return Goal(self.action, {**self._identity(), "operation": "renew"})
 
+    def _identity(self) -> dict[str, Any]:
+        return {name: self.data[name] for name in ("demand", "requesters")}
 
-def _identity(data: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: data[name] for name in ("demand", "requesters")}
-
-
-@dataclass(frozen=True, slots=True)
-class BookedDemand:
-    """A demand in the bookkeeping; without an id, ``request`` is of a DeploymentRequest."""
-
-    demand: str
-    request: str
-    requesters: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class RuleDemand:
-    action: Action
-    data: Mapping[str, Any]
-
-    def goal(self, values: Values) -> Goal:
+    def filled(self, values: Values) -> Goal:
         return Goal(self.action, filled(self.data, values))
 
     def names(self) -> set[str]:
@@ -173,22 +161,20 @@ class RuleDemand:
     def outline(self, values: Values) -> Goal:
         """Return a goal that suffices to end the demand, and starts it if no value is missing."""
         if self.names() <= set(values):
-            return self.goal(values)
+            return self.filled(values)
         # Only the template of a ``Demand`` may have names whose values become unknown.
-        return Goal(self.action, filled(_identity(self.data), values))
+        return Goal(self.action, filled(self._identity(), values))
 
     def subjects_of(
-        self, held: BookedDemand, subjects: tuple[str, ...], rule: str
+        self, booked: BookedDemand, subjects: tuple[str, ...], rule: str
     ) -> Values | None:
         """Return the entities of the event for which the rule made a booked demand, or ``None``."""
-        named = {*requesters_in(self.action, self.data)}
-        is_own, held_id = self.action == "demand", held.demand or held.request
-        if len(held.requesters) > len(named) or is_own != bool(held.demand):
+        action, booked_id, requesters = booked
+        if len(requesters) > len(self.requesters) or action != self.action:
             return None
         # The id alone may not tell the entities: ``{entity}-{other}`` can give ``a-b-c`` in two
         # ways. So the requesters are read as well, and each combination is tried.
-        pairs = [(str(self.data["demand"] if is_own else self.data.get("id", "")), held_id)]
-        pairs += product(sorted(named), held.requesters)
+        pairs = [(self.id, booked_id), *product(self.requesters, requesters)]
         entities: dict[str, set[str]] = {name: set() for name in subjects}
         for template, text in pairs:
             for name, entity in candidates(template, text).items():
@@ -196,19 +182,22 @@ class RuleDemand:
         for combination in product(*(sorted(entities[name]) for name in subjects)):
             values = dict(zip(subjects, combination, strict=True))
             goal = self.outline({"rule": rule, **values})
-            if (goal.id, goal.requesters) == (held_id, tuple(sorted(held.requesters))):
+            if (goal.id, goal.requesters) == (booked_id, tuple(sorted(requesters))):
                 return values
         return None
 
 
-def requesters_in(action: Action, data: Mapping[str, Any]) -> Iterator[str]:
-    if action == "demand":
-        yield from data.get("requesters", ())
+def requester_lists(action: Action, data: Mapping[str, Any]) -> Iterator[tuple[str, Sequence[str]]]:
+    # each with its place in the goal
+    if action == "Demand":
+        yield "requesters", data.get("requesters", ())
         return
-    for app in data.get("apps", ()):
-        yield from app.get("object_detection_fusion_app", {}).get("requester_ids", ())
-    for connection in data.get("connections", ()):
-        yield from connection.get("requester_ids", ())
+    kind = "object_detection_fusion_app"
+    for index, app in enumerate(data.get("apps", ())):
+        ids = app.get(kind, {}).get("requester_ids", ())
+        yield f"apps[{index}].{kind}.requester_ids", ids
+    for index, connection in enumerate(data.get("connections", ())):
+        yield f"connections[{index}].requester_ids", connection.get("requester_ids", ())
 
 
 # ---- the checks of what a rule demands: the template's names, the demand's form and ids ----
@@ -227,7 +216,7 @@ _SAMPLE: Values = {
 
 
 def faults_of_demand(
-    template: RuleDemand, field: str, subjects: tuple[str, ...], momentary: frozenset[str]
+    template: Goal, field: str, subjects: tuple[str, ...], momentary: frozenset[str]
 ) -> list[Fault]:
     """Return the faults of a rule's demand: of its names, else of its form, else of its ids.
 
@@ -235,11 +224,11 @@ def faults_of_demand(
     """
     # A ``DeploymentRequest`` is sent again to renew it and with ``shutdown`` to end it. It must be
     # the same then, also after a restart, when momentary values are not known.
-    known = {"rule", *subjects, *(momentary if template.action == "demand" else ())}
+    known = {"rule", *subjects, *(momentary if template.action == "Demand" else ())}
     if problems := faults(template.data, field, known):
         return problems
     data = filled(template.data, _SAMPLE)
-    if template.action == "demand":
+    if template.action == "Demand":
         fixed = [name for name in ("apiVersion", "kind", "operation") if name in data]
         malformed = form_faults({**_HEAD, **data})
     else:
@@ -261,13 +250,13 @@ def faults_of_demand(
     return problems or list(_faults_of_ids(template, field, {f"{{{name}}}" for name in subjects}))
 
 
-def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
+def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fault]:
     """Yield a fault for each id that is missing, may change, or would be that of two events."""
     data: Any = template.data
-    if template.action == "demand":
+    if template.action == "Demand":
         yield from _missing(data, field, "demand", "requesters")
         why = "otherwise two events would share one demand"
-        listed = [("demand", [data.get("demand", "")])]
+        listed: list[tuple[str, Sequence[str]]] = [("demand", [data.get("demand", "")])]
         for name, what in (("demand", "id"), ("requesters", "requesters")):
             for path, text in texts(data.get(name, ()), f"{field}.{name}"):
                 if changing := sorted(names(text) - {"rule", "entity", "other"}):
@@ -278,15 +267,7 @@ def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterat
     else:
         yield from _missing(data, field, "id")
         why = "a shutdown ends what its requesters joined, so each event needs its own requesters"
-        kind = "object_detection_fusion_app"
-        listed = [
-            (f"apps[{index}].{kind}.requester_ids", app.get(kind, {}).get("requester_ids", []))
-            for index, app in enumerate(data.get("apps", ()))
-        ]
-        listed += [
-            (f"connections[{index}].requester_ids", connection.get("requester_ids", []))
-            for index, connection in enumerate(data.get("connections", ()))
-        ]
+        listed = [*requester_lists(template.action, data)]
     for path, values in listed:
         missing = needed - {f"{{{name}}}" for value in values for name in names(value)}
         if missing and any(values):
@@ -419,10 +400,10 @@ class Rule(CamelModel):
         return frozenset({"value"} if self.threshold else {"count"} if self.count else ())
 
     @property
-    def template(self) -> RuleDemand:
+    def template(self) -> Goal:
         if self.demand is not None:
-            return RuleDemand("demand", self.demand)
-        return RuleDemand("deployment_request", self.deployment_request or {})
+            return Goal("Demand", self.demand)
+        return Goal("DeploymentRequest", self.deployment_request or {})
 
     def is_for(self, *entities: str) -> bool:
         # The patterns of a rule for pairs from two sources limit only the entity of the first.

@@ -7,7 +7,7 @@ whenever it is shown, and is stored nowhere.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from demandops.base.naming import Subject, SubjectKind
@@ -22,87 +22,15 @@ from demandops.model.release import ServiceRelease, claims_of
 from demandops.views import release_causes
 
 # those that the plain data lacks if they are empty
-_LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
+_LEFT_OUT = ("demands", "suspended", "nodes", "waiting", "targets", "listed")
 # Topic → the requesters of the topic, sorted.
 _Requesters: TypeAlias = dict[str, list[str]]
+Json: TypeAlias = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class ServiceEntry:
-    applications: list[str]
-    service: str
-    node: str
-    source: str | None
-    source_topic: str | None
-    version: str  # of the chart
-    application_version: str | None  # in registry/versions.yaml
-    versions_asked: dict[str, list[str]]
-    parameters: dict[str, object]
-    inputs: dict[str, _Requesters]  # by role
-    requesters: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class ConnectionEntry:
-    type: str
-    source: str
-    target: str
-    topics: _Requesters
-    requesters: list[str]
-    # by topic, where they differ: its name at the target, and the ids that demands list it under
-    targets: dict[str, str]
-    listed: dict[str, list[str]]
-
-
-@dataclass(frozen=True, slots=True)
-class SuspendedEntry:
-    kind: str
-    id: str
-    demand: str
-    requesters: list[str]
-    override: str
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class WaitingEntry:
-    demand: str
-    requesters: list[str]
-    since: str
-    priority: int
-
-
-@dataclass(frozen=True, slots=True)
-class ResourceEntry:
-    """What services request of a node's resource, and the capacity, as Kubernetes quantities."""
-
-    requested: str
-    capacity: str
-
-
-@dataclass(frozen=True, slots=True)
-class DemandEntry:
-    action: Literal["Demand", "DeploymentRequest"]  # the ROS action that takes such a demand
-    request: str
-    requesters: list[str]
-    # applications that it does not list, each with those that read its outputs
-    held_for: dict[str, list[str]]
-
-
-@dataclass(frozen=True, slots=True)
-class Bookkeeping:
-    services: dict[str, ServiceEntry]  # by release name; all mappings are sorted
-    connections: dict[str, ConnectionEntry]
-    # also those whose claims are suspended, but no service or connection counts these claims
-    demands: dict[str, DemandEntry]
-    suspended: list[SuspendedEntry]
-    nodes: dict[str, dict[str, ResourceEntry]]  # that declare a capacity
-    waiting: list[WaitingEntry]  # in the order of the tries to book
-
-
-def bookkeeping(world: World) -> Bookkeeping:
+def bookkeeping(world: World) -> Json:
     active = without_suspended(world)
-    services, connections = {}, {}
+    services, connections = dict[str, Json](), dict[str, Json]()
     for release in release_causes.releases(world):
         if not isinstance(release, ServiceRelease):
             continue
@@ -114,19 +42,19 @@ def bookkeeping(world: World) -> Bookkeeping:
             for role, topic in demanded_inputs(active, release, claim.application):
                 if topic in inputs[role]:  # a claim that a person wrote may name another topic
                     inputs[role][topic].update(claim.requesters)
-        services[release.name] = ServiceEntry(
-            applications=list(release.applications),
-            service=release.key.service,
-            node=release.node.id,
-            source=release.key.source,
-            source_topic=release.key.topic,
-            version=release.chart.version,
-            application_version=release.version.name or None,
-            versions_asked=release_causes.versions_asked(release, active.ledger),
-            parameters=dict(release.parameters),
-            inputs={role: _sorted(topics) for role, topics in inputs.items()},
-            requesters=list(release.requesters),
-        )
+        services[release.name] = {
+            "applications": list(release.applications),
+            "service": release.key.service,
+            "node": release.node.id,
+            "source": release.key.source,
+            "source_topic": release.key.topic,
+            "version": release.chart.version,
+            "application_version": release.version.name or None,  # in registry/versions.yaml
+            "versions_asked": release_causes.versions_asked(release, active.ledger),
+            "parameters": dict(release.parameters),
+            "inputs": {role: _sorted(topics) for role, topics in inputs.items()},
+            "requesters": list(release.requesters),
+        }
     for id in world.ledger.subjects(SubjectKind.CONNECTION):
         first, claims = active.ledger.connection(id), active.ledger.connection_claims(id)
         if first is None or not claims:
@@ -139,67 +67,87 @@ def bookkeeping(world: World) -> Bookkeeping:
                 requesters[route.source].update(claim.requesters)
                 if route.listed:
                     listed.setdefault(route.source, set()).add(route.listed)
-        connections[id] = ConnectionEntry(
-            type=first.type.word if first.type else "",
-            source=first.source,
-            target=first.target,
-            topics=_sorted(requesters),
-            requesters=list(requesters_of(claims)),
-            targets={r.source: r.target for r in routes if r.source != r.target},
-            listed=_sorted(dict(sorted(listed.items()))),
-        )
+        connections[id] = {
+            "type": first.type.word if first.type else "",
+            "source": first.source,
+            "target": first.target,
+            "topics": _sorted(requesters),
+            "requesters": list(requesters_of(claims)),
+            # by topic, where they differ: its name at the target, and the ids that demands list it
+            # under
+            "targets": {r.source: r.target for r in routes if r.source != r.target},
+            "listed": _sorted(dict(sorted(listed.items()))),
+        }
     suspended = [
-        SuspendedEntry(
-            claim.subject.kind.value[:-1],
-            claim.subject.id,
-            claim.demand,
-            list(claim.requesters),
-            override.path,
-            override.reason,
-        )
+        {
+            "kind": claim.subject.kind.value[:-1],
+            "id": claim.subject.id,
+            "demand": claim.demand,
+            "requesters": list(claim.requesters),
+            "override": override.path,
+            "reason": override.reason,
+        }
         for claim, override in suspended_claims(world)
     ]
     waiting = [
-        WaitingEntry(
-            demand.demand,
-            list(demand.requesters),
-            demand.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
-            demand.put.priority,
-        )
+        {
+            "demand": demand.demand,
+            "requesters": list(demand.requesters),
+            "since": demand.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "priority": demand.put.priority,
+        }
         for demand in in_turn(world.ledger.waiting)
     ]
+    return {
+        "services": dict(sorted(services.items())),  # by release name
+        "connections": connections,
+        # also those whose claims are suspended, but no service or connection counts these claims
+        "demands": _demands(world),
+        "suspended": suspended,
+        # of those that declare a capacity, what services request of each resource, and the capacity
+        "nodes": _nodes(world),
+        "waiting": waiting,  # in the order of the tries to book
+    }
+
+
+def _demands(world: World) -> dict[str, Json]:
     by_demand: dict[str, list[Claim]] = {}
     subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
     for claim in (claim for subject in subjects for claim in world.ledger.claims_on(subject)):
         if claim.keeping_override is None:  # a claim that an override keeps is of no demand
             by_demand.setdefault(claim.demand, []).append(claim)
-    demands = {
-        demand: DemandEntry(
-            "DeploymentRequest" if claims[0].joined else "Demand",
-            claims[0].request,
-            list(requesters_of(claims)),
-            {
-                claim.subject.id: list(claim.application.held_for)
-                for claim in claims
-                if claim.is_on_application and claim.application.held_for
-            },
-        )
-        for demand, claims in sorted(by_demand.items())
-    }
-    services = dict(sorted(services.items()))
-    return Bookkeeping(services, connections, demands, suspended, _nodes(world), waiting)
+    demands: dict[str, Json] = {}
+    for demand, claims in sorted(by_demand.items()):
+        demands[demand] = {
+            # the ROS action that takes such a demand
+            "action": "DeploymentRequest" if claims[0].joined else "Demand",
+            "request": claims[0].request,
+            "requesters": list(requesters_of(claims)),
+        }
+        # applications that it does not list, each with those that read its outputs
+        held_for = {
+            claim.subject.id: list(claim.application.held_for)
+            for claim in claims
+            if claim.is_on_application and claim.application.held_for
+        }
+        if held_for:
+            demands[demand]["held_for"] = held_for
+    return demands
 
 
-def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
+def _nodes(world: World) -> dict[str, dict[str, Json]]:
     usage, config = whole_usage(world), world.config
-    nodes: dict[str, dict[str, ResourceEntry]] = {}
+    nodes: dict[str, dict[str, Json]] = {}
     # A machine that is in several access domains is one entry, because it has one capacity.
     machines = {id: node for id, node in config.nodes.items() if id not in config.hosts}
     for id, node in sorted(machines.items()):
         names = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
         limits = ((name, node.most(name)) for name in sorted(names))
         resources = {
-            name: ResourceEntry(amount_text(usage.of(id, name), name), amount_text(most, name))
+            name: {
+                "requested": amount_text(usage.of(id, name), name),
+                "capacity": amount_text(most, name),
+            }
             for name, most in limits
             if most is not None
         }
@@ -212,7 +160,7 @@ def _sorted(topics: dict[str, set[str]]) -> _Requesters:
     return {topic: sorted(who) for topic, who in topics.items()}
 
 
-def carried_topics(entry: Mapping[str, Any]) -> _Requesters:
+def carried_topics(entry: Json) -> _Requesters:
     """Return the requesters of each topic of a connection, in words such as ``/raw as /points``."""
     targets, listed = entry.get("targets", {}), entry.get("listed", {})
     return {
@@ -223,15 +171,12 @@ def carried_topics(entry: Mapping[str, Any]) -> _Requesters:
     }
 
 
-def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
-    data = asdict(view) | {"commit": commit}
-    for entry in data["demands"].values():
-        if not entry["held_for"]:
-            del entry["held_for"]
-    for entry in data["connections"].values():
-        for name in ("targets", "listed"):
-            if not entry[name]:
-                del entry[name]
+def as_data(view: Json, commit: str) -> Json:
+    connections = {
+        id: {name: part for name, part in entry.items() if part or name not in _LEFT_OUT}
+        for id, entry in view["connections"].items()
+    }
+    data = view | {"connections": connections, "commit": commit}
     return {name: part for name, part in data.items() if part or name not in _LEFT_OUT}
 
 
@@ -245,58 +190,52 @@ class EntryChange:
     gained: tuple[str, ...] = ()
 
 
-_Entry = ServiceEntry | ConnectionEntry
-
-
 def _changes(
-    kind: Literal["service", "connection"], old: Mapping[str, _Entry], new: Mapping[str, _Entry]
+    kind: Literal["service", "connection"], old: Mapping[str, Json], new: Mapping[str, Json]
 ) -> Iterator[EntryChange]:
     for name in sorted({*old, *new}):
         if name not in new:
-            yield EntryChange(kind, name, "removed", old[name].requesters)
+            yield EntryChange(kind, name, "removed", old[name]["requesters"])
         elif name not in old:
-            yield EntryChange(kind, name, "added", new[name].requesters)
+            yield EntryChange(kind, name, "added", new[name]["requesters"])
         elif old[name] != new[name]:
             had, has = list(_facts(old[name], new[name])), list(_facts(new[name], old[name]))
             lost = tuple(fact for fact in had if fact not in has)
             gained = tuple(fact for fact in has if fact not in had)
-            yield EntryChange(kind, name, "changed", new[name].requesters, lost, gained)
+            yield EntryChange(kind, name, "changed", new[name]["requesters"], lost, gained)
 
 
-def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
+def bookkeeping_changes(old: Json, new: Json) -> tuple[EntryChange, ...]:
     return (
-        *_changes("service", old.services, new.services),
-        *_changes("connection", old.connections, new.connections),
+        *_changes("service", old["services"], new["services"]),
+        *_changes("connection", old["connections"], new["connections"]),
     )
 
 
-def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
-    yield from (f"requester {requester}" for requester in entry.requesters)
-    if isinstance(entry, ConnectionEntry):
-        yield f"from {entry.source} to {entry.target}"
-        yield f"by {entry.type}"
+def _facts(entry: Json, other: Json) -> Iterator[str]:
+    yield from (f"requester {requester}" for requester in entry["requesters"])
+    if "topics" in entry:
+        yield f"from {entry['source']} to {entry['target']}"
+        yield f"by {entry['type']}"
     else:
-        yield f"on {entry.node}"
-        yield from (f"for {application}" for application in entry.applications)
-        yield f"version {entry.version}"
-        if entry.application_version:
-            yield f"application version {entry.application_version}"
-        for version, requesters in entry.versions_asked.items():
+        yield f"on {entry['node']}"
+        yield from (f"for {application}" for application in entry["applications"])
+        yield f"version {entry['version']}"
+        if entry["application_version"]:
+            yield f"application version {entry['application_version']}"
+        for version, requesters in entry["versions_asked"].items():
             yield f"version {version} for {', '.join(requesters)}"
-        yield from (f"{name} = {value}" for name, value in sorted(entry.parameters.items()))
+        yield from (f"{name} = {value}" for name, value in sorted(entry["parameters"].items()))
     others = _topics(other)
     for topic, requesters in sorted(_topics(entry).items()):
         yield topic
         # a requester that ``other`` lacks is not repeated here, because it is a fact above
-        lasting = (who for who in requesters if topic in others and who in other.requesters)
+        lasting = (who for who in requesters if topic in others and who in other["requesters"])
         yield from (f"{topic} for {who}" for who in lasting)
 
 
-def _topics(entry: _Entry) -> _Requesters:
-    if isinstance(entry, ConnectionEntry):
-        inputs = {"topic": carried_topics(asdict(entry))}
-    else:
-        inputs = entry.inputs
+def _topics(entry: Json) -> _Requesters:
+    inputs = {"topic": carried_topics(entry)} if "topics" in entry else entry["inputs"]
     return {
         f"{role} {topic}": requesters
         for role, topics in inputs.items()

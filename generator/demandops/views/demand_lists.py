@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Literal
+from typing import Any, Literal
 
 from demandops.base.naming import SubjectKind
 from demandops.decide.planning.overrides import suspended_by
 from demandops.model.config.config import Config
-from demandops.model.config.inventory import Position, PropertyValue
 from demandops.model.demand.demand import Lease
 from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import World
@@ -107,25 +106,8 @@ def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> Iterator[str]:
 # ---- the nodes, and what uses each of them ----
 
 
-@dataclass(frozen=True, slots=True)
-class UsedNode:
-    """A node of the inventory or of a claim, and what uses it, if only as a source of inputs."""
-
-    name: str
-    type: str | None
-    cluster: str | None
-    domain: str | None
-    drained: bool
-    capabilities: tuple[str, ...]
-    properties: Mapping[str, PropertyValue]
-    position: Position | None
-    releases: tuple[str, ...]
-    applications: tuple[str, ...]
-    connections: tuple[str, ...]
-    requesters: tuple[str, ...]
-
-
-def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
+def nodes(world: World, releases: Iterable[Release]) -> list[dict[str, Any]]:
+    # those of the inventory and of claims, and what uses each, if only as a source of inputs
     running: defaultdict[str, list[str]] = defaultdict(list)
     for release in releases:
         running[release.node.id].append(release.name)
@@ -139,19 +121,19 @@ def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
     for id in sorted({*inventory, *needing}):
         node, domain, claims = inventory.get(id), world.config.domain_of.get(id), needing[id]
         used.append(
-            UsedNode(
-                name=id,
-                type=node.type if node else None,
-                cluster=node.cluster if node else None,
-                domain=domain.name if domain else None,
-                drained=bool(node and node.drained),
-                capabilities=node.capabilities if node else (),
-                properties=node.properties if node else {},
-                position=node.position if node else None,
-                releases=tuple(sorted(running[id])),
-                applications=tuple(sorted({*ids_of(claims, SubjectKind.APPLICATION)})),
-                connections=tuple(sorted({*ids_of(claims, SubjectKind.CONNECTION)})),
-                requesters=requesters_of(claims),
-            )
+            {
+                "name": id,
+                "type": node.type if node else None,
+                "cluster": node.cluster if node else None,
+                "domain": domain.name if domain else None,
+                "drained": bool(node and node.drained),
+                "capabilities": node.capabilities if node else (),
+                "properties": dict(node.properties) if node else {},
+                "position": node.position.model_dump() if node and node.position else None,
+                "releases": sorted(running[id]),
+                "applications": sorted({*ids_of(claims, SubjectKind.APPLICATION)}),
+                "connections": sorted({*ids_of(claims, SubjectKind.CONNECTION)}),
+                "requesters": requesters_of(claims),
+            }
         )
     return used

@@ -85,6 +85,14 @@ def affected_releases(entry: Entry, world: World) -> list[Release]:
     return [by_name[name] for name in sorted(by_name)]
 
 
+_WITHOUT_EFFECT = {
+    "matches nothing": "has no effect now, because its field 'select' matches nothing, or nothing "
+    "to which its effects apply; if it should have an effect, correct it",
+    "held back": "changes nothing, because another override with 'hold' keeps the same files as "
+    "they are; remove one of the two overrides, or give this one a higher priority",
+}
+
+
 def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
     """Yield (file, warning) for each override without effect, or whose replicas repeat outputs."""
     for entry in entries:
@@ -94,18 +102,8 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
                 override.path,
                 f"expired at {format_time(override.end)}; remove the file, or write a later time",
             )
-        elif entry.state == "matches nothing":
-            yield (
-                override.path,
-                "has no effect now, because its field 'select' matches nothing, or nothing to "
-                "which its effects apply; if it should have an effect, correct it",
-            )
-        elif entry.state == "held back":
-            yield (
-                override.path,
-                "changes nothing, because another override with 'hold' keeps the same files as "
-                "they are; remove one of the two overrides, or give this one a higher priority",
-            )
+        elif entry.state in _WITHOUT_EFFECT:
+            yield override.path, _WITHOUT_EFFECT[entry.state]
         elif (override.replicas or 0) > 1:
             # An override with a higher rank may set another number. Several replicas are a warning
             # and no fault, because a person may have pinned an image that divides its work.

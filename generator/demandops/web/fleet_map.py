@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
@@ -19,6 +20,9 @@ HEAD = 30.0
 _GAP = 14.0
 _PLACE_HEIGHT = 640.0
 _TYPES = ("cloud", "edge", "station", "vehicle")
+
+# A cluster's name, and its x, y, width and height on the map.
+Box = tuple[str, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,15 +67,6 @@ class NodeCard:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
-    name: str
-    x: float
-    y: float
-    width: float
-    height: float
-
-
 def by_cluster(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], list[Box], float]:
@@ -86,7 +81,7 @@ def by_cluster(
         inside, width, height = _box(groups, is_alone=len(clusters) == 1)
         if x and x + width > WIDTH:
             x, y, shelf = 0.0, y + shelf + _GAP, 0.0
-        boxes.append(Box(name, x, y, width, height))
+        boxes.append((name, x, y, width, height))
         placed |= {card.id: replace(card, x=card.x + x, y=card.y + y) for card in inside}
         x, shelf = x + width + _GAP, max(shelf, height)
     return placed, boxes, y + shelf
@@ -182,33 +177,7 @@ class Line:
     title: str
 
 
-# Many nodes or lines of one color, drawn together as one path.
-@dataclass(frozen=True, slots=True)
-class Mass:
-    tone: str
-    path: str
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    width: float
-    height: float
-    boxes: tuple[Box, ...]
-    # Nodes and lines that are drawn one by one, with details.
-    nodes: tuple[NodeCard, ...]
-    lines: tuple[Line, ...]
-    # The others, one shape for each color, so that a map of thousands of nodes stays small.
-    many_nodes: tuple[Mass, ...]
-    many_lines: tuple[Mass, ...]
-    total: int
-    only_lit: bool
-    layout: str
-    layouts: tuple[str, ...]
-    is_dimmed: bool
-    lit: int
-
-
-def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
+def picture(now: Situation, wanted: Filter, layout: str) -> dict[str, Any]:
     # A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a
     # position. If no drawn node has a position, nodes are drawn by cluster.
     config = now.commit_state.config
@@ -234,10 +203,8 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
         for row in rows_of(now, "connections"):
             if wanted.matches(row):
                 lit.update(row.hidden["node"])
-        for node in nodes:
-            row = Row({}, {"node": [node.id], "type": [node.type], "cluster": [node.cluster]})
-            if wanted.matches(row):
-                lit.add(node.id)
+        own = ({"node": [n.id], "type": [n.type], "cluster": [n.cluster]} for n in nodes)
+        lit.update(texts["node"][0] for texts in own if wanted.matches(Row({}, texts)))
         lit &= marks.keys()
     only_lit = len(nodes) > _MOST_NAMED and 0 < len(lit) <= _MOST_NAMED
     if only_lit:
@@ -249,30 +216,30 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
     else:
         cards, boxes, height = by_cluster(cards, nodes)
     many, few = _apart(list(cards.values()), _MOST_NODES)
-    masses = {
-        tone: "".join(
-            f"M{card.x:.0f} {card.y:.0f}h{card.width:.0f}v{card.height:.0f}h-{card.width:.0f}z"
-            for card in group
-        )
-        for tone, group in _by_tone(many)
-    }
     more, lines = _apart(_lines(now, wanted, cards), _MOST_LINES)
-    curves = {tone: "".join(line.path for line in group) for tone, group in _by_tone(more)}
-    return Picture(
-        WIDTH,
-        height,
-        tuple(boxes),
-        tuple(few),
-        tuple(lines),
-        tuple(Mass(*each) for each in sorted(masses.items())),
-        tuple(Mass(*each) for each in sorted(curves.items())),
-        total,
-        only_lit,
-        layout,
-        layouts,
-        bool(wanted) and not only_lit,
-        len(lit),
-    )
+    # The path of all that is not drawn one by one, by color: a map of thousands of nodes stays
+    # small.
+    masses, curves = defaultdict[str, str](str), defaultdict[str, str](str)
+    for card in many:
+        across = f"{card.width:.0f}"
+        masses[card.tone] += f"M{card.x:.0f} {card.y:.0f}h{across}v{card.height:.0f}h-{across}z"
+    for line in more:
+        curves[line.tone] += line.path
+    return {
+        "width": WIDTH,
+        "height": height,
+        "boxes": boxes,
+        "nodes": few,
+        "lines": lines,
+        "many_nodes": sorted(masses.items()),
+        "many_lines": sorted(curves.items()),
+        "total": total,
+        "only_lit": only_lit,
+        "layout": layout,
+        "layouts": layouts,
+        "is_dimmed": bool(wanted) and not only_lit,
+        "lit": len(lit),
+    }
 
 
 _Drawn = TypeVar("_Drawn", "NodeCard", "Line")
@@ -286,13 +253,6 @@ def _apart(drawn: list[_Drawn], most: int) -> tuple[list[_Drawn], list[_Drawn]]:
     if len(lit) > most:
         return drawn, []
     return [part for part in drawn if not part.is_lit], lit
-
-
-def _by_tone(drawn: Iterable[_Drawn]) -> Iterable[tuple[str, list[_Drawn]]]:
-    groups: dict[str, list[_Drawn]] = {}
-    for part in drawn:
-        groups.setdefault(part.tone, []).append(part)
-    return groups.items()
 
 
 def _card(node: Node, marks: list[ServiceMark], is_lit: bool, total: int) -> NodeCard:

@@ -38,8 +38,8 @@ class ClusterWatch:
         self._caches = object_caches(clusters, on_change, REAL)
         self.clusters = frozenset(self._caches)
         self._domains = set[ClusterDomain]()
-        self._states: dict[str, str] = {}
-        self._unhealthy_from: dict[str, float] = {}
+        # The word for the health of each release, and since when it is not healthy.
+        self._seen: dict[str, tuple[str, float | None]] = {}
         self._changes = deque[HealthChange](maxlen=_KEPT)
 
     @property
@@ -62,23 +62,20 @@ class ClusterWatch:
         status_of = {target.name: status for target, status in zip(targets, reported, strict=True)}
         at = REAL.monotonic()
         for name, status in status_of.items():
-            before, after = self._states.get(name, ""), word_of(status)
+            (before, began), after = self._seen.get(name, ("", None)), word_of(status)
             if before == after:
                 continue
-            self._states[name] = after
             lasted = None
             if after == "healthy":
-                began = self._unhealthy_from.pop(name, None)
-                lasted = None if began is None else at - began
-            elif after != "unknown":
-                self._unhealthy_from.setdefault(name, at)
+                lasted, began = None if began is None else at - began, None
+            elif after != "unknown" and began is None:
+                began = at
+            self._seen[name] = after, began
             if before:  # the first health that a cluster reports of a release is no change
                 reason = status.health.reason
                 change = HealthChange(REAL.now(), name, before, after, reason, lasted)
                 self._changes.append(change)
-        for name in self._states.keys() - status_of.keys():
-            del self._states[name]
-            self._unhealthy_from.pop(name, None)
+        self._seen = {name: self._seen[name] for name in status_of}
         return replace(
             situation,
             statuses=status_of,

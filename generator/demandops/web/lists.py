@@ -17,27 +17,19 @@ from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
 from demandops.views import demand_lists
-from demandops.web.situation import RANKS, WORDS, ReusableRows, Situation, word_of, worst_word
+from demandops.web.situation import RANKS, WORDS, Situation, word_of, worst_word
 
 # ---- lists that can be filtered, sorted and paged, as plain values ----
 
 # How many rows a page of a list has at most.
 PAGE = 100
 
-# How many texts of a cell the page shows.
-_MOST_PARTS = 4
-
-
-@dataclass(frozen=True, slots=True)
-class Link:
-    path: str
-    params: Mapping[str, str] = field(default_factory=dict)
-
 
 @dataclass(frozen=True, slots=True)
 class Part:
     text: str
-    link: Link | None = None
+    view: str = ""  # to which it links, with parameters
+    params: Mapping[str, str] = field(default_factory=dict)
 
 
 Text: TypeAlias = "str | int | Part"
@@ -52,14 +44,6 @@ class Cell:
     order: float | str | None = None  # by default the time or the first text
 
     @property
-    def shown(self) -> tuple[Part, ...]:
-        return self.parts[:_MOST_PARTS]
-
-    @property
-    def more(self) -> int:
-        return max(0, len(self.parts) - _MOST_PARTS)
-
-    @property
     def rank(self) -> tuple[bool, float, str]:
         # in ascending order, empty cells come last
         if (order := self.order) is None:
@@ -67,12 +51,6 @@ class Cell:
         if isinstance(order, str):
             return order == "", 0.0, order.casefold()
         return False, float(order), ""
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    key: str
-    title: str
 
 
 @dataclass(frozen=True)
@@ -93,17 +71,6 @@ class Row:
     @cached_property
     def all_texts(self) -> str:
         return "\n".join(text for texts in self.texts.values() for text in texts)
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
-    total: int  # of all rows of the list
-    matching: int
-    sort: str  # the key of a column, with `-` in front for the reverse order
-    page: int
-    pages: int
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
@@ -145,19 +112,6 @@ def exactly(key: str, value: str) -> str:
     return shlex.quote(f"{key}={value}")
 
 
-def table(
-    columns: Sequence[Column], rows: Iterable[Row], wanted: Filter, sort: str, page: int
-) -> Table:
-    every = list(rows)
-    matching = [row for row in every if wanted.matches(row)]
-    key = sort.removeprefix("-")
-    if key not in {column.key for column in columns}:
-        sort = key = columns[0].key
-    matching.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
-    shown, page, pages = page_of(matching, page, PAGE)
-    return Table(tuple(columns), tuple(shown), len(every), len(matching), sort, page, pages)
-
-
 def page_of(items: Sequence[Item], page: int, size: int) -> tuple[Sequence[Item], int, int]:
     pages = max(1, -(-len(items) // size))
     page = min(max(page, 1), pages)
@@ -170,10 +124,9 @@ Values: TypeAlias = "tuple[Any, ...]"
 
 
 class ListKind:
-    name: str  # in addresses
     title: str
     about: str
-    columns: tuple[Column, ...]
+    columns: Mapping[str, str]  # the titles, by the keys of a row's cells
     entries: Callable[[Situation], Iterator[tuple[str, Values]]]  # each with its id
     # Makes a row of the values of an entry. While these stay the same, it is called again only if
     # the configuration or the overrides have changed.
@@ -181,11 +134,11 @@ class ListKind:
 
 
 def _release_part(name: str) -> Part:
-    return Part(name, Link("release", {"name": name}))
+    return Part(name, "release", {"name": name})
 
 
 def _demand_part(id: str) -> Part:
-    return Part(id, Link("demand", {"id": id}))
+    return Part(id, "demand", {"id": id})
 
 
 def _health_cell(word: str) -> Cell:
@@ -193,19 +146,18 @@ def _health_cell(word: str) -> Cell:
 
 
 def _linked(view: str, key: str, values: Iterable[str]) -> Cell:
-    return cell(*(Part(value, Link(view, {"q": exactly(key, value)})) for value in values))
+    return cell(*(Part(value, view, {"q": exactly(key, value)}) for value in values))
 
 
 def _requesters(requesters: Iterable[str]) -> Cell:
     return _linked("demands", "requester", requesters)
 
 
-def _columns(keys_and_titles: str) -> tuple[Column, ...]:
-    return tuple(Column(*column.split("|")) for column in keys_and_titles.split(", "))
+def _columns(keys_and_titles: str) -> dict[str, str]:
+    return dict(column.split("|") for column in keys_and_titles.split(", "))
 
 
 class DemandsList(ListKind):
-    name = "demands"
     title = "Demands"
     about = "What requesters hold, until they release it or its lease ends."
     columns = _columns(
@@ -249,7 +201,6 @@ class DemandsList(ListKind):
 
 
 class ServicesList(ListKind):
-    name = "services"
     title = "Services"
     about = "One row for each Helm release: a service on a node, shared by all who need it."
     columns = _columns(
@@ -284,7 +235,6 @@ class ServicesList(ListKind):
 
 
 class ConnectionsList(ListKind):
-    name = "connections"
     title = "Connections"
     about = "Topics that are carried from one node to another."
     columns = _columns(
@@ -328,7 +278,6 @@ class ConnectionsList(ListKind):
 
 
 class LeasesList(ListKind):
-    name = "leases"
     title = "Leases"
     about = "Claims that end unless their requester renews them. The first to end comes first."
     columns = _columns(
@@ -359,21 +308,24 @@ class LeasesList(ListKind):
 
 
 LISTS: dict[str, ListKind] = {
-    kind.name: kind for kind in (DemandsList(), ServicesList(), ConnectionsList(), LeasesList())
+    "demands": DemandsList(),
+    "services": ServicesList(),
+    "connections": ConnectionsList(),
+    "leases": LeasesList(),
 }
 
 
 def rows_of(now: Situation, name: str) -> list[Row]:
     commit_state, kind = now.commit_state, LISTS[name]
-    reusable = commit_state.rows.get(name, ReusableRows(None, {}))
+    statuses, shown = commit_state.rows.get(name, (None, {}))
     # the follower makes a new mapping of statuses whenever it looks, so the same mapping means that
     # nothing has changed
-    if reusable.statuses is not now.statuses:
+    if statuses is not now.statuses:
         rows: dict[str, tuple[Values, Row]] = {}
         for id, values in kind.entries(now):
-            before = reusable.rows.get(id)
+            before = shown.get(id)
             if before is None or before[0] != values:
                 before = values, kind.row(commit_state.state, *values)
             rows[id] = before
-        reusable = commit_state.rows[name] = ReusableRows(now.statuses, rows)
-    return [row for _, row in reusable.rows.values()]
+        commit_state.rows[name], shown = (now.statuses, rows), rows
+    return [row for _, row in shown.values()]

@@ -19,8 +19,8 @@ from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import GENERATOR_NAME
 from demandops.views import release_causes
-from demandops.web.lists import Cell, Filter, Link, Part, Row, cell, exactly
-from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of, worst_word
+from demandops.web.lists import Cell, Filter, Part, Row, cell, exactly
+from demandops.web.situation import CommitState, Situation, since_of, word_of, worst_word
 
 # ---- who can probably fix a release that is not ready ----
 
@@ -36,12 +36,8 @@ KINDS: dict[str, str] = {
 LastChange = Callable[[str], "LogEntry | None"]
 
 
-@dataclass(frozen=True, slots=True)
-class Remedy:
-    who: str  # can fix the cause; all else may be empty
-    how: str = ""
-    command: str = ""
-
+# Who can fix a cause, how, and a command; the latter two may be empty.
+Remedy = tuple[str, str, str]
 
 # What kubelet and the scheduler write into a pod's status, which the reason of a release quotes.
 _IMAGE = re.compile(r"ImagePull|ErrImage|InvalidImage|manifest unknown|pull access denied", re.I)
@@ -60,26 +56,26 @@ def remedy_of(
     command = shlex.join(describe) if short else ""
     if word == "cluster":
         how = "make its API reachable from here, and let this page read it (docs/status.md)"
-        return Remedy(f"the operator of cluster {cluster}", how)
+        return f"the operator of cluster {cluster}", how, ""
     if kind == "waiting" or word in ("Kustomization", "GitRepository", "Application"):
         who = f"the operator of the GitOps controller of cluster {cluster}"
         if kind != "failing":
             who = (
                 f"the GitOps controller of cluster {cluster}; if the controller fails, its operator"
             )
-        return Remedy(who, "", command)
+        return who, "", command
     if kind == "starting":
         who = f"nobody yet; if this lasts, the operator of cluster {cluster}"
-        return Remedy(who, "", command)
+        return who, "", command
     if release.shaping.by:
         override = release.shaping.by[-1][0]
-        return Remedy(
+        return (
             f"{override.owner}, who owns {override.path}, which changes this release",
             f"correct or remove {override.path} by pull request",
             command,
         )
     if _ROOM.search(reason):
-        return Remedy(
+        return (
             f"the operator of node {release.node.id} in cluster {cluster}",
             "make room on the node, or name another node in the demand",
             command,
@@ -94,17 +90,17 @@ def remedy_of(
         ]
         files = dict.fromkeys(config.file_of(IMAGES_FILE, name) for name in names)
         by = _changed_by(files, last_change)
-        return Remedy(
+        return (
             f"the publisher of image {', '.join(image.reference() for image in images)}",
             f"push the image, or correct its entry in {' or '.join(files)} by pull request{by}",
             command,
         )
     how = "look at the log of the container" if _CRASH.search(reason) else ""
     if not isinstance(release, ServiceRelease):
-        return Remedy(f"the maintainer of the {release.type.word} client", how, command)
+        return f"the maintainer of the {release.type.word} client", how, command
     where = f"appdefs/{release.service.folder}"
     by = _changed_by([where], last_change)
-    return Remedy(f"the maintainer of {where}{by}", how, command)
+    return f"the maintainer of {where}{by}", how, command
 
 
 def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
@@ -123,17 +119,15 @@ class Cause:
     kind: Kind
     what: Part
     why: str
-    remedy: Remedy
+    who: str  # can fix it
+    how: str = ""
+    command: str = ""
     since: datetime | None = None
     told: str = ""  # details, such as a cluster's message, or a person's reason
     releases: tuple[str, ...] = ()  # empty if the cause is not found by release
     applications: tuple[str, ...] = ()
     requesters: tuple[str, ...] = ()
     demands: tuple[str, ...] = ()
-
-    @property
-    def tone(self) -> str:
-        return KINDS[self.kind]
 
     def row(self) -> Row:
         texts = {
@@ -150,10 +144,6 @@ class Ready:
     application: str
     word: str  # for a health, or the kind of the first cause
     causes: tuple[Cause, ...]
-
-    @property
-    def tone(self) -> str:
-        return {**WORDS, **KINDS}[self.word]
 
 
 def causes(
@@ -207,10 +197,8 @@ def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Caus
             "unread",
             Part("The state repo"),
             "cannot be read, so this page may be out of date",
-            Remedy(
-                "the operator of the Git server or of this page",
-                "mend what the text above names; the page tries again",
-            ),
+            "the operator of the Git server or of this page",
+            "mend what the text above names; the page tries again",
             told=now.unread,
         )
     if now.push_denied:
@@ -218,7 +206,8 @@ def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Caus
             "unread",
             Part("The state repo"),
             "takes no commit of this generator, so demands wait, and are refused after some time",
-            Remedy("the operator of the Git server", "let the generator's account push to main"),
+            "the operator of the Git server",
+            "let the generator's account push to main",
             told=now.push_denied,
         )
     for problem in now.commit_state.problems:
@@ -232,11 +221,9 @@ def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Caus
             "invalid",
             Part(f"{problem.file or 'The configuration'}{field}"),
             f"is not valid, so the configuration of commit {str(held)[:10]} stays in effect",
-            Remedy(
-                who,
-                now.commit_state.remedy or "correct the file by pull request",
-                f"git show {problem.since[:10]}" if problem.since else "demandops check .",
-            ),
+            who,
+            now.commit_state.remedy or "correct the file by pull request",
+            f"git show {problem.since[:10]}" if problem.since else "demandops check .",
             told=problem.message,
             since=change.time if change else None,
         )
@@ -257,11 +244,9 @@ def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[
             "suspended",
             what,
             f"{state}, but {override.path} denies it",
-            Remedy(
-                f"{override.owner}, who owns the override",
-                f"remove the file by pull request{ends if override.expires else ''}",
-                shlex.join(["git", "rm", override.path]),
-            ),
+            f"{override.owner}, who owns the override",
+            f"remove the file by pull request{ends if override.expires else ''}",
+            shlex.join(["git", "rm", override.path]),
             told=override.reason,
             releases=releases,
             applications=tuple(dict.fromkeys(applications)),
@@ -275,13 +260,13 @@ def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[
         by_override.setdefault(override.name, (override, []))[1].append(claim)
     for override, suspended in by_override.values():
         names = dict.fromkeys(claim.subject.id for claim in suspended)
-        what = Part(" and ".join(names), Link("overrides"))
+        what = Part(" and ".join(names), "overrides")
         applications = _applications_with(commit_state, suspended)
         yield denial(override, what, "is booked", suspended, applications)
     # the claims that need a denied release are not suspended as a whole
     for release, override in commit_state.denied:
         needing = release_causes.claims_behind(commit_state.active.ledger, release)
-        what = Part(release.description, Link("release", {"name": release.name}))
+        what = Part(release.description, "release", {"name": release.name})
         served = release.applications if isinstance(release, ServiceRelease) else ()
         yield denial(override, what, "is needed", needing, served, (release.name,))
 
@@ -290,12 +275,10 @@ def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
     for waiting in in_turn(now.commit_state.state.ledger.waiting):
         yield Cause(
             "waiting",
-            Part(waiting.demand, Link("demands", {"q": exactly("demand", waiting.demand)})),
+            Part(waiting.demand, "demands", {"q": exactly("demand", waiting.demand)}),
             "waits for room on a node",
-            Remedy(
-                "the generator, as soon as a node has room; the nodes' operator can add room, or a "
-                "requester can release something"
-            ),
+            "the generator, as soon as a node has room; the nodes' operator can add room, or a "
+            "requester can release something",
             since=waiting.since,
             requesters=waiting.requesters,
             demands=(waiting.demand,),
@@ -303,13 +286,11 @@ def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
     for proposal in now.proposals:
         yield Cause(
             "decision",
-            Part(proposal.summary, Link("overrides")),
+            Part(proposal.summary, "overrides"),
             "awaits a person's approval",
-            Remedy(
-                "a person who may merge to main",
-                "merge the branch to approve the demand, or delete the branch to refuse it",
-                shlex.join(["demandops", "approve", proposal.branch, "--commit", proposal.commit]),
-            ),
+            "a person who may merge to main",
+            "merge the branch to approve the demand, or delete the branch to refuse it",
+            shlex.join(["demandops", "approve", proposal.branch, "--commit", proposal.commit]),
             since=proposal.since,
             requesters=proposal.requesters,
             demands=proposal.demands,
@@ -319,7 +300,9 @@ def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
             "decision",
             Part(old.file),
             f"is not applied to cluster '{old.cluster}' in the current version",
-            Remedy(f"an administrator of cluster {old.cluster}", "apply it", old.command),
+            f"an administrator of cluster {old.cluster}",
+            "apply it",
+            old.command,
             told=f"access domains: {', '.join(old.domains)}",
         )
     for orphan in now.orphans:
@@ -327,7 +310,9 @@ def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
             "decision",
             Part(orphan.object),
             f"runs on cluster '{orphan.cluster}', but belongs to no release",
-            Remedy(f"an administrator of cluster {orphan.cluster}", "delete it", orphan.command),
+            f"an administrator of cluster {orphan.cluster}",
+            "delete it",
+            orphan.command,
             told="the GitOps controller no longer knows that it created this object",
         )
     if not_rendered:
@@ -337,10 +322,8 @@ def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
             "waiting",
             Part("1 generated file" if count == 1 else f"{count} generated files"),
             f"{'waits' if count == 1 else 'wait'} for a generator to carry out a person's commit",
-            Remedy(
-                "the operator of the generator",
-                "start a generator; a running generator carries out the commit at its next fetch",
-            ),
+            "the operator of the generator",
+            "start a generator; a running generator carries out the commit at its next fetch",
             told=", ".join(not_rendered[:_MOST_LISTED]) + more,
             since=now.commit_state.entry.time,
         )
@@ -358,10 +341,10 @@ def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
     for (word, object, reason, cluster), names in together.items():
         releases = [now.commit_state.releases[name] for name in names]
         first, several = releases[0], len(names) > 1
-        what = Part(first.description, Link("release", {"name": names[0]}))
+        what = Part(first.description, "release", {"name": names[0]})
         if several:
-            link = Link("services", {"q": f"cluster={cluster}"})
-            what = Part(f"{len(names)} releases in {cluster}", link)
+            query = {"q": f"cluster={cluster}"}
+            what = Part(f"{len(names)} releases in {cluster}", "services", query)
         kind: Kind = "failing" if word == "failing" else "starting"
         fail, have, are = ("fail", "have", "are") if several else ("fails", "has", "is")
         why = fail if kind == "failing" else f"{are} starting and not ready yet"
@@ -383,7 +366,7 @@ def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
             kind,
             what,
             why,
-            remedy_of(kind, first, now.commit_state.config, object, reason, last_change),
+            *remedy_of(kind, first, now.commit_state.config, object, reason, last_change),
             since=min(times, default=None),
             told=f"{object}: {reason}" if object else reason,
             releases=tuple(names),

@@ -35,10 +35,11 @@ from demandops.model.config.base_model import relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
 from demandops.views.release_causes import override_state
-from demandops.web import fleet_map, lists, not_ready, release_view, time_line
+from demandops.web import fleet_map, lists, not_ready, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
-from demandops.web.lists import LISTS, Filter, Link, Row, rows_of
-from demandops.web.situation import Situation
+from demandops.web.lists import LISTS, Filter, Part, Row, rows_of
+from demandops.web.release_view import explained_demand, explained_release
+from demandops.web.situation import WORDS, Situation
 
 # ---- the views, by address ----
 
@@ -48,7 +49,7 @@ _KEPT = ("at", "q")
 NAVIGATION = (
     ("", "Not ready"),
     ("map", "Map"),
-    *((kind.name, kind.title) for kind in LISTS.values()),
+    *((name, kind.title) for name, kind in LISTS.items()),
     ("timeline", "Time line"),
     ("overrides", "Overrides"),
     ("rates", "Rates"),
@@ -86,9 +87,9 @@ class ViewRequest:
         query = f"?{urlencode(params)}" if params else ""
         return f"/{self.path if path is None else path}{query}"
 
-    def link(self, link: Link) -> str:
+    def link(self, part: Part) -> str:
         # with its own filter instead of the current one
-        return self.to(link.path, **{"q": "", **link.params})
+        return self.to(part.view, **{"q": "", **part.params})
 
 
 def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
@@ -97,32 +98,41 @@ def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
     pending = asked.follower.not_rendered(commit_state)
     causes = not_ready.causes(asked.situation, asked.filter, last_change, pending)
     applications = not_ready.applications(asked.situation, causes, asked.filter)
-    data = {"causes": causes[:_MOST_CAUSES], "total": len(causes), "applications": applications}
-    return "not_ready.html.j2", data
+    return "not_ready.html.j2", {
+        "causes": causes[:_MOST_CAUSES],
+        "total": len(causes),
+        "applications": applications,
+        "tones": {**WORDS, **not_ready.KINDS},
+    }
 
 
 def _list(asked: ViewRequest) -> tuple[str, Data]:
-    kind = LISTS[asked.path]
-    rows = rows_of(asked.situation, kind.name)
-    table = lists.table(kind.columns, rows, asked.filter, asked.get("sort"), asked.page())
-    return "list.html.j2", {"kind": kind, "table": table}
-
-
-def _demand(asked: ViewRequest) -> tuple[str, Data]:
-    now, reader = asked.situation, asked.follower.reader()
-    return "demand.html.j2", {"demand": release_view.explained_demand(now, reader, asked.get("id"))}
-
-
-def _release(asked: ViewRequest) -> tuple[str, Data]:
-    now, reader = asked.situation, asked.follower.reader()
-    release = release_view.explained_release(now, reader, asked.get("name"))
-    return "release.html.j2", {"release": release}
+    kind, sort = LISTS[asked.path], asked.get("sort")  # `-` before a key is the reverse order
+    rows = rows_of(asked.situation, asked.path)
+    matching = [row for row in rows if asked.filter.matches(row)]
+    if (key := sort.removeprefix("-")) not in kind.columns:
+        sort = key = next(iter(kind.columns))
+    matching.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
+    shown, page, pages = lists.page_of(matching, asked.page(), lists.PAGE)
+    return "list.html.j2", {
+        "kind": kind,
+        "rows": shown,
+        "total": len(rows),
+        "matching": len(matching),
+        "sort": sort,
+        "page": page,
+        "pages": pages,
+    }
 
 
 def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     now, lane = asked.situation, asked.get("lane")
-    events = time_line.events(asked.follower.history, asked.follower.health_changes)
-    events = time_line.matching(events, asked.filter, lane if lane in time_line.LANES else "")
+    lanes = {lane} if lane in time_line.LANES else time_line.LANES
+    events = [
+        event
+        for event in time_line.events(asked.follower.history, asked.follower.health_changes)
+        if event.lane in lanes and (not asked.filter or asked.filter.matches(event.row()))
+    ]
     chosen = None if now.is_newest else (now.commit_state.entry.time, now.commit_state.commit)
     changed: list[str] = []
     if asked.get("at"):
@@ -179,8 +189,14 @@ VIEWS: Mapping[str, View] = {
         {"map": fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))},
     ),
     **{f"/{name}": _list for name in LISTS},
-    "/demand": _demand,
-    "/release": _release,
+    "/demand": lambda asked: (
+        "demand.html.j2",
+        {"demand": explained_demand(asked.situation, asked.follower.reader(), asked.get("id"))},
+    ),
+    "/release": lambda asked: (
+        "release.html.j2",
+        {"release": explained_release(asked.situation, asked.follower.reader(), asked.get("name"))},
+    ),
     "/timeline": _timeline,
     "/overrides": _overrides,
     "/rates": _rates,

@@ -74,13 +74,6 @@ class Planned:
     claims: list[Claim]  # that need the release
 
 
-@dataclass(frozen=True, slots=True)
-class ReusableRows:
-    # The status of each release when the rows were made; None if they are of an earlier commit.
-    statuses: object
-    rows: Mapping[str, tuple[tuple[Any, ...], Any]]  # the values and the row of each entry
-
-
 class CommitState:
     def __init__(
         self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem, ...], remedy: str = ""
@@ -89,8 +82,9 @@ class CommitState:
         self.snapshot, self.entry, self.problems, self.remedy = snapshot, entry, problems, remedy
         self.commit, self.state = str(snapshot.commit), snapshot.state
         self.config = snapshot.state.config
-        # The rows of each list that was shown, by the list's name.
-        self.rows: dict[str, ReusableRows] = {}
+        # For each list that was shown, by its name: the status of each release when the rows were
+        # made, or None if they are of an earlier commit; and the values and the row of each entry.
+        self.rows: dict[str, tuple[object, Mapping[str, tuple[tuple[Any, ...], Any]]]] = {}
         self._entries: list[Entry] | None = None
         # The newest commit that changed a path; None if none did. Paths are looked up when asked
         # for, because each look-up walks through the history.
@@ -127,7 +121,7 @@ class CommitState:
             if (release := self._plan(key)) or denied_release(new, key):
                 planned[key] = release
         self.planned = planned
-        self.rows = {name: replace(rows, statuses=None) for name, rows in before.rows.items()}
+        self.rows = {name: (None, rows) for name, (_, rows) in before.rows.items()}
 
     def _with_other_claims(
         self, before: CommitState, subjects: Iterable[Subject]

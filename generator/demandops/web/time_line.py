@@ -8,11 +8,12 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from functools import partial
 from statistics import median
+from typing import Any
 
 from demandops.model.config.base_model import span
 from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.repo.history.commit_message import PROPOSAL
-from demandops.web.lists import Filter, Row, cell
+from demandops.web.lists import Row, cell
 from demandops.web.situation import WORDS, Commit, HealthChange
 
 # ---- the time line of events ----
@@ -63,32 +64,6 @@ class Event:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Dot:
-    lane: str  # of the events, which are close together
-    x: float
-    radius: float
-    count: int
-    label: str
-    commit: str  # of the newest event; empty for a change of health
-    tone: str
-    is_chosen: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    x: float
-    label: str
-
-
-@dataclass(frozen=True, slots=True)
-class Strip:
-    span: str
-    dots: tuple[Dot, ...]
-    ticks: tuple[Tick, ...]
-    chosen: float | None  # where the chosen commit is; None if the picture does not show it
-
-
 def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Event]:
     all_events = [of_commit(commit) for commit in commits]
     for change in health:
@@ -113,17 +88,9 @@ def of_commit(commit: Commit) -> Event:
     return Event(lane, entry.time, word, entry.summary, who, entry.commit)
 
 
-def matching(events: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
-    return [
-        event
-        for event in events
-        if lane in ("", event.lane) and (not wanted or wanted.matches(event.row()))
-    ]
-
-
 def strip(
     events: Sequence[Event], now: datetime, span: str, chosen: tuple[datetime, str] | None
-) -> Strip:
+) -> dict[str, Any]:
     # It ends at ``now``; the events are newest first. If ``span`` is no key of ``SPANS``, it is the
     # shortest that has enough events. ``chosen`` is the time and the id of the chosen commit.
     if span not in SPANS:
@@ -153,48 +120,32 @@ def strip(
         more = f", and {count - 1} more" if count > 1 else ""
         what = " ".join(filter(None, (newest.release, newest.summary)))
         label = f"{newest.time:%Y-%m-%d %H:%M:%S} UTC, {newest.word}: {what}{more}"
-        tone = "bad" if any(event.tone == "bad" for event in group) else newest.tone
-        is_chosen = chosen is not None and any(event.commit == chosen[1] for event in group)
-        x, radius = (place + 0.5) * _STRIP_WIDTH / _BINS, min(4.0 + math.log2(count), 8.0)
-        dots.append(Dot(lane, x, radius, count, label, newest.commit, tone, is_chosen))
+        dot = {
+            "lane": lane,
+            "x": (place + 0.5) * _STRIP_WIDTH / _BINS,
+            "radius": min(4.0 + math.log2(count), 8.0),
+            "label": label,
+            "commit": newest.commit,  # empty for a change of health
+            "tone": "bad" if any(event.tone == "bad" for event in group) else newest.tone,
+            "is_chosen": chosen is not None and any(e.commit == chosen[1] for e in group),
+        }
+        dots.append(dot)
     step = next((step for step in _STEPS_S if length / step <= _TICKS), length / _TICKS)
     form = "%H:%M:%S" if step < 60 else "%H:%M" if step < 86400 else "%m-%d"
-    ticks, at = list[Tick](), math.ceil(start.timestamp() / step) * step
+    ticks, at = list[tuple[float, str]](), math.ceil(start.timestamp() / step) * step
     while at <= now.timestamp():
         moment = datetime.fromtimestamp(at, tz=timezone.utc)
-        ticks.append(Tick(x_of(moment), moment.strftime(form)))
+        ticks.append((x_of(moment), moment.strftime(form)))
         at += step
-    mark = x_of(chosen[0]) if chosen else None
-    shown = mark if mark is not None and 0 <= mark <= _STRIP_WIDTH else None
-    return Strip(span, tuple(dots), tuple(ticks), shown)
+    mark = x_of(chosen[0]) if chosen else -1
+    shown = mark if 0 <= mark <= _STRIP_WIDTH else None
+    return {"span": span, "dots": dots, "ticks": ticks, "chosen": shown}
 
 
 # ---- plots of rates and latencies ----
 
 WIDTH, HEIGHT = 560, 150
 _RATE_BINS = 48
-
-
-@dataclass(frozen=True, slots=True)
-class Bar:
-    x: float
-    y: float
-    width: float
-    height: float
-    label: str  # when its bin of time begins, and its value
-
-
-@dataclass(frozen=True, slots=True)
-class Plot:
-    title: str
-    unit: str
-    about: str
-    bars: tuple[Bar, ...]
-    top: str  # the highest value of the axis
-    first: datetime
-    last: datetime
-    summary: str
-    table: tuple[tuple[datetime, str], ...]  # without the bins of time whose value is 0
 
 
 # When a value was measured, and the value.
@@ -206,7 +157,7 @@ _RELEASED = {"shutdown", "release", "expire", "decommission"}
 
 def plots(
     commits: Sequence[Commit], health: Sequence[HealthChange], now: datetime, span: str
-) -> list[Plot]:
+) -> list[dict[str, Any]]:
     # A ``span`` that is no key of ``SPANS`` means the time since the oldest of ``commits``.
     seconds = SPANS.get(span, 0)
     oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
@@ -247,7 +198,7 @@ def _counted(commits: Iterable[Commit], operations: set[str]) -> list[Sample]:
 
 def _plot(
     start: datetime, span_s: float, is_rate: bool, title: str, about: str, samples: list[Sample]
-) -> Plot:
+) -> dict[str, Any]:
     bin_s, bins = span_s / _RATE_BINS, [list[float]() for _ in range(_RATE_BINS)]
     for time, value in samples:
         place = int((time - start).total_seconds() / bin_s)
@@ -267,18 +218,24 @@ def _plot(
     top = max(*values, 1.0)  # at least 1, so that bins without a value divide by no zero
     width = WIDTH / _RATE_BINS
     starts = [start + timedelta(seconds=bin_s * n) for n in range(_RATE_BINS)]
-    texts = [f"{value:.3g}{suffix}" for value in values]
-    bars = tuple(
-        Bar(
-            round(n * width + 1, 2),
-            round(HEIGHT * (1 - value / top), 2),
-            round(width - 2, 2),
-            round(HEIGHT * value / top, 2),
-            f"{starts[n]:%Y-%m-%d %H:%M:%S} UTC: {texts[n]}",
-        )
+    bars = [
+        {
+            "x": round(n * width + 1, 2),
+            "y": round(HEIGHT * (1 - value / top), 2),
+            "width": round(width - 2, 2),
+            "height": round(HEIGHT * value / top, 2),
+            "time": starts[n],
+            "value": f"{value:.3g}{suffix}",
+        }
         for n, value in enumerate(values)
         if value
-    )
-    table = tuple((starts[n], texts[n]) for n, value in enumerate(values) if value)
-    end = start + timedelta(seconds=span_s)
-    return Plot(title, unit, about, bars, f"{top:.3g}{suffix}", start, end, summary, table)
+    ]
+    return {
+        "title": title,
+        "unit": unit,
+        "about": about,
+        "bars": bars,
+        "top": f"{top:.3g}{suffix}",
+        "first": start,
+        "summary": summary,
+    }

@@ -231,7 +231,7 @@ class DemandSender:
 
     def _send(self, goal: Goal) -> Outcome:
         try:
-            if goal.action == "demand":
+            if goal.action == "Demand":
                 answer = self._demands.send(goal.data)
                 texts = (f"{answer.outcome} in {answer.commit}", *answer.warnings)
                 return Outcome("", one_line("; warning: ".join(texts)), answer.lease_s)

@@ -149,7 +149,7 @@ def _map(replay: Replay, color_of: Callable[[str], str]) -> Iterator[str]:
     ys = [y for track in replay.tracks.values() for _, y in track]
     for _, condition in areas:
         around = condition.stop if isinstance(condition, Near) else condition.radius
-        low_x, low_y, high_x, high_y = condition.area.bounds
+        low_x, low_y, high_x, high_y = condition.bounds
         xs += (low_x - around, high_x + around)
         ys += (low_y - around, high_y + around)
     # positions in metres become positions in the picture, where y grows downwards
@@ -162,7 +162,7 @@ def _map(replay: Replay, color_of: Callable[[str], str]) -> Iterator[str]:
 
     labels: dict[tuple[float, float], list[str]] = {}
     for name, condition in areas:
-        corners = [at(*corner) for corner in condition.area.corners]
+        corners = [at(*corner) for corner in condition.corners]
         x, y = corners[0]
         labels.setdefault((x, y), []).append(name)
         if len(corners) > 1:
@@ -313,7 +313,7 @@ def as_data(replay: Replay) -> dict[str, Any]:
                 "entities": list(event.subjects),
                 "change": "start" if event.starts else "stop",
                 "reason": event.why,
-                "action": None if goal is None else goal.action_name,
+                "action": None if goal is None else goal.action,
                 "goal": None if goal is None else goal.document,
             }
             for event, goal in replay.events

@@ -57,8 +57,8 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     assert page.texts("h1") == ["1 of 1 application is not ready"]
     (cause,) = causes(follower.newest, follower)
     assert (cause.kind, cause.told) == ("suspended", "The road is closed")
-    assert cause.remedy.who == "traffic-control, who owns the override"
-    assert cause.remedy.command == "git rm overrides/roadworks.yaml"
+    assert cause.who == "traffic-control, who owns the override"
+    assert cause.command == "git rm overrides/roadworks.yaml"
     assert cause.requesters == ("station00", "vehicle01")
     changed = follower.last_change(follower.newest.commit_state, "overrides/roadworks.yaml")
     assert changed and cause.since == changed.time
@@ -88,8 +88,8 @@ def test_an_invalid_file_names_who_wrote_it(
     page = look("/")
     (cause,) = causes(follower.newest, follower)
     assert cause.kind == "invalid"
-    assert cause.remedy.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
-    assert cause.remedy.command.startswith("git show ")
+    assert cause.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
+    assert cause.command.startswith("git show ")
     assert "registry/images.yaml" in look("/overrides").text
     assert "stays in effect" in page.text and "git revert --no-edit -m 1 " in page.text
 
@@ -215,13 +215,13 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
         "the nodes have positions",
     )
     drawn = fleet_map.picture(follower.newest, Filter(""), "")
-    assert (drawn.layout, drawn.layouts) == ("place", ("cluster", "place"))
-    for layout in drawn.layouts:
-        cards = fleet_map.picture(follower.newest, Filter(""), layout).nodes
+    assert (drawn["layout"], drawn["layouts"]) == ("place", ("cluster", "place"))
+    for layout in drawn["layouts"]:
+        cards = fleet_map.picture(follower.newest, Filter(""), layout)["nodes"]
         for one in cards:
             assert one.x >= 0 and one.x + one.width <= fleet_map.WIDTH
             assert not [o for o in cards if o is not one and _cover(one, o)]
-    by_id = {card.id: card for card in drawn.nodes}
+    by_id = {card.id: card for card in drawn["nodes"]}
     ids = [node["id"] for node in nodes["nodes"]]
     assert by_id[ids[0]].x < by_id[ids[1]].x < by_id[ids[2]].x
     assert by_id[ids[-1]].y < by_id[ids[0]].y

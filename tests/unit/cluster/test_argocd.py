@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 from demandops.cluster.health import (
     ClusterDomain,
-    ObjectName,
     ObjectSelector,
     Target,
     health_reader,
@@ -18,7 +17,9 @@ from tests.kit.cluster import Case, Letters, condition, deployments, read_cases,
 
 URL = "https://git.example/fleet.git"
 COMMITS = Letters()
-PLACE = ClusterDomain("c-its", "perception", "ns", ObjectName("argocd", "demandops-perception"))
+PLACE = ClusterDomain(
+    "c-its", "perception", "ns", ObjectSelector("Application", "argocd", "demandops-perception")
+)
 ARGOCD = health_reader(PLACE)
 SERVICE = Target(PLACE, "od-edge", is_service=True)
 CLIENT = Target(PLACE, "mqtt-a", is_service=False)

@@ -16,7 +16,7 @@ from demandops.base.errors import InvalidInput
 from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.config_map_watch import ConfigMapWatch
-from demandops.cluster.health import ClusterDomain, ObjectName, ObjectSelector, Target
+from demandops.cluster.health import ClusterDomain, ObjectSelector, Target
 from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.rollouts import RolloutWatcher
 from demandops.decide.decision import decide
@@ -233,10 +233,13 @@ def test_without_a_kubeconfig_the_process_must_be_a_pod(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize(
     ("case", "application"),
-    [("experiment", None), ("argocd-experiment", ObjectName("argocd", "demandops-perception"))],
+    [
+        ("experiment", None),
+        ("argocd-experiment", ObjectSelector("Application", "argocd", "demandops-perception")),
+    ],
 )
 def test_a_rollout_target_names_its_argo_cd_application_or_none_for_flux(
-    case: str, application: ObjectName | None
+    case: str, application: ObjectSelector | None
 ) -> None:
     state, files = start(case)
     goal = strict_yaml.load(requests_of(case)[0].read_text())

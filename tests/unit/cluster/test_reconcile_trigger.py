@@ -12,8 +12,9 @@ from time import monotonic
 
 import pytest
 from demandops.base.errors import InvalidInput
+from demandops.base.http_call import NoAnswer
 from demandops.cluster import clusters_file, reconcile_trigger
-from demandops.cluster.clusters_file import ClusterAccess, NoAccess
+from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import REQUESTED_AT
 from demandops.cluster.reconcile_trigger import ReconcileTrigger, _Wake, signature, web_address
 
@@ -311,5 +312,5 @@ def test_the_other_controller_s_webhook_is_not_called(
 def test_a_repository_is_named_by_the_page_that_a_forge_would_name(
     repo: str, page: str | None
 ) -> None:
-    with pytest.raises(NoAccess, match="names no host") if page is None else nullcontext():
+    with pytest.raises(NoAnswer, match="names no host") if page is None else nullcontext():
         assert web_address(repo) == page

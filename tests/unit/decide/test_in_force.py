@@ -73,7 +73,7 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
         assert {p: t for p, t in generated.items() if p in again} == again
         assert [p for p in generated if p.startswith("clusters/") and p not in again] == []
         entries = bookkeeping(books.state)
-        told = {(one.id, one.demand) for one in entries.suspended}
+        told = {(one["id"], one["demand"]) for one in entries["suspended"]}
         for claim in ledger:
             suspended = "eve" in claim.requesters or claim.subject.id == "v2/edge"
             assert ((claim.subject.id, claim.demand) in told) is suspended
@@ -82,9 +82,9 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
                 assert ledger.claims_on(claim.subject) == (claim,), (
                     "a kept claim must be the only one"
                 )
-        for entry in entries.services.values():
-            assert (entry.service, entry.node) != ("object-detection", "cloud")
-        assert "v2/edge" not in entries.connections
+        for entry in entries["services"].values():
+            assert (entry["service"], entry["node"]) != ("object-detection", "cloud")
+        assert "v2/edge" not in entries["connections"]
 
 
 def after(books: MemoryRepo, changed: dict[str, str | None]) -> dict[str, str]:

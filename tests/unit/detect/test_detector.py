@@ -179,11 +179,11 @@ def test_a_step_leaves_the_state_before_as_it_was() -> None:
 
 
 GOALS = {
-    "put": Goal("demand", {"demand": "d", "requesters": ["a"], "applications": [1]}),
-    "other": Goal("demand", {"demand": "d", "requesters": ["a"], "applications": [2]}),
-    "others": Goal("demand", {"demand": "d", "requesters": ["a", "b"], "applications": [1]}),
-    "join": Goal("deployment_request", {"id": "r", "apps": []}),
-    "changed": Goal("deployment_request", {"id": "r", "apps": [1]}),
+    "put": Goal("Demand", {"demand": "d", "requesters": ["a"], "applications": [1]}),
+    "other": Goal("Demand", {"demand": "d", "requesters": ["a"], "applications": [2]}),
+    "others": Goal("Demand", {"demand": "d", "requesters": ["a", "b"], "applications": [1]}),
+    "join": Goal("DeploymentRequest", {"id": "r", "apps": []}),
+    "changed": Goal("DeploymentRequest", {"id": "r", "apps": [1]}),
 }
 
 

@@ -14,7 +14,7 @@ from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.settings import data_folder
 from demandops.cli.authoring import scaffold
 from demandops.cli.authoring.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
-from demandops.cli.changes.override import override_text
+from demandops.cli.changes.override import effect_options, override_text
 from demandops.cli.json_output import Command, output_option, show
 from demandops.cli.output import busy
 from demandops.decide.state import State, try_configuration
@@ -161,12 +161,7 @@ def application(  # noqa: PLR0913 - as many as options
     "--application", "apps", multiple=True, metavar="PATTERN", help="Select applications by id."
 )
 @click.option("--node", "nodes", multiple=True, metavar="PATTERN", help="Select nodes by id.")
-@click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
-@click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
-@click.option("--keep", is_flag=True, help="Keep services running after their last demand ends.")
-@click.option(
-    "--replicas", type=click.IntRange(min=0), metavar="N", help="Set the number of replicas."
-)
+@effect_options
 @_directory("The checked-out state repo.")
 @output_option
 def override(  # noqa: PLR0913 - as many as options

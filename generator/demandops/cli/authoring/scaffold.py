@@ -115,7 +115,6 @@ def application_files(
 ) -> dict[str, str]:
     # by path, with those of the library chart, ``library``, if the state repo lacks it; ``texts``
     # has the files in ``templates/scaffold/application`` by name
-    refuse_name(plan.name, config)
     has_library = f"{LIBRARY_FOLDER}/Chart.yaml" in config.files
     shared = config.files if has_library else library
     version = re.search(r"(?m)^version: (\S+)$", shared[f"{LIBRARY_FOLDER}/Chart.yaml"])
@@ -140,7 +139,7 @@ def application_files(
     values = _filled(texts["chart-values.yaml"], given)
     schema = charts.composed(
         f"Values of the chart {plan.name}",
-        {"launch": _LAUNCH},
+        {"launch": json.loads(texts["launch.schema.json"])},
         values,
         json.loads(shared[f"{LIBRARY_FOLDER}/values.schema.json"]),
         shared[f"{LIBRARY_FOLDER}/values.yaml"],
@@ -214,22 +213,6 @@ def _appdef(plan: ApplicationPlan, config: Config) -> str:
     )
     path = f"appdefs/{plan.name}/appdef.yaml"
     return document(path, "application", "ApplicationDefinition", fields, note)
-
-
-_LAUNCH: dict[str, Any] = {
-    "type": "object",
-    "additionalProperties": False,
-    "required": ["package", "file", "arguments"],
-    "properties": {
-        "package": {"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9_]*$"},
-        "file": {"type": "string", "pattern": "^[A-Za-z0-9_][A-Za-z0-9_.-]*$"},
-        "arguments": {
-            "type": "object",
-            "propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"},
-            "additionalProperties": {"type": "string"},
-        },
-    },
-}
 
 
 def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:

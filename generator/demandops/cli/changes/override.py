@@ -2,27 +2,104 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
 from datetime import timedelta
+from functools import wraps
+from pathlib import Path
 from typing import Any
 
 import click
 
-from demandops.base import naming, strict_yaml
+from demandops.base import naming, settings, strict_yaml
 from demandops.base.errors import InvalidInput, suggestion
 from demandops.base.naming import id_problem
-from demandops.base.quoting import quoted
+from demandops.base.quoting import harmless, one_line, quoted
 from demandops.base.runtime import REAL
+from demandops.base.settings import MAIN_BRANCH
 from demandops.base.strict_yaml import read_input
+from demandops.cli import json_output, target
 from demandops.cli.authoring.scaffold import document
 from demandops.cli.changes import person_change
-from demandops.cli.changes.person_change import Edit, EditOptions, selector, writable
-from demandops.cli.output import errors
+from demandops.cli.changes.person_change import writable
+from demandops.cli.json_output import Json
+from demandops.cli.output import done, errors, progress
 from demandops.cli.target import names_of
-from demandops.model.config.base_model import parse_time, seconds_of
+from demandops.model.config.base_model import parse_file, parse_time, seconds_of
 from demandops.model.config.load import is_override_name
-from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
+from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
+from demandops.model.ledger.ledger import World
+from demandops.repo.forge import ForgeError, forge_for
 from demandops.repo.reader import Reader
-from demandops.views.release_causes import Entry
+from demandops.repo.write import person_commit
+from demandops.repo.write.person_commit import CommitDetails, Published
+from demandops.serve.approvals.proposal import merge_request
+from demandops.views.release_causes import override_report
+
+# ---- what the commands share: their options and selection ----
+
+
+@dataclass(frozen=True, slots=True)
+class EditOptions:
+    state_repo: str
+    signing_key: Path | None
+    reason: str
+    propose: bool
+    dry_run: bool
+    yes: bool
+    output: str
+
+
+def editing(command: target.Command) -> target.Command:
+    # the command gets the values of these options as `options`
+
+    @wraps(command)
+    def run(**given: Any) -> Any:  # noqa: ANN401
+        options = EditOptions(
+            **{field.name: given.pop(field.name) for field in fields(EditOptions)}
+        )
+        return command(options=options, **given)
+
+    return target.with_options(
+        person_change.reason_option,
+        click.option(
+            "--propose",
+            is_flag=True,
+            help="Push a branch instead of committing to main. If demandops.yaml names a forge, "
+            "also open a merge request.",
+        ),
+        target.dry_run_option,
+        person_change.yes_option,
+        target.writable_repo_option,
+        target.signing_option,
+        json_output.output_option,
+    )(run)
+
+
+selecting = target.name_options(
+    {
+        name: f"Select this {name}; * matches any text, ? one character. May be repeated."
+        for name in ("application", "appdef", "service", "connection", "node", "requester")
+    },
+    metavar="NAME",
+    multiple=True,
+)
+
+
+def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
+    return {name: list(values) for name, values in given.items() if values}
+
+
+effect_options = target.with_options(
+    click.option("--hold", is_flag=True, help="Keep the rendered files as they are."),
+    click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims."),
+    click.option(
+        "--keep", is_flag=True, help="Keep services running after their last demand ends."
+    ),
+    click.option(
+        "--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas."
+    ),
+)
 
 # ---- ``demandops override``: create or end an override ----
 
@@ -50,11 +127,8 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
 
 @override.command()
 @click.argument("name", metavar="NAME", callback=_new_name)
-@person_change.selecting
-@click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
-@click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
-@click.option("--keep", is_flag=True, help="Keep services running after their last demand ends.")
-@click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas.")
+@selecting
+@effect_options
 @click.option("--on", "target", metavar="NODE", help="Move services to this node.")
 @click.option(
     "--use-version", "version", metavar="WORD", help="Pin the chart to a version or channel."
@@ -77,7 +151,7 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
     help="When the override ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
 )
 @click.option("--owner", metavar="NAME", help="Who is responsible. Default: your name in git.")
-@person_change.editing
+@editing
 def create(  # noqa: PLR0913, PLR0917 - each is an option
     name: str,
     hold: bool,
@@ -127,7 +201,7 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
 
 @override.command()
 @click.argument("name", metavar="NAME", shell_complete=names_of("overrides"))
-@person_change.editing
+@editing
 def end(name: str, options: EditOptions) -> None:
     """End an override: remove its file.
 
@@ -139,7 +213,7 @@ def end(name: str, options: EditOptions) -> None:
       demandops override end calm --dry-run
     """
     with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
-        end_override(repo, Edit(name, None, f"End override {name}", options.reason), options)
+        end_override(repo, name, f"End override {name}", options)
 
 
 def create_override(
@@ -160,48 +234,110 @@ def create_override(
             person = repo.operator()
             owner = person.email if id_problem(person.name) else person.name
         fields = {"reason": options.reason, **more, "owner": owner, "select": [chosen]}
-        text = override_text(name, fields)
-        edit = Edit(name, text, summary, options.reason)
-        if repo.file_reader()(edit.path) is not None:
+        if repo.file_reader()(_path_of(name)) is not None:
             message = "exists already; end it first, or choose another name"
-            raise InvalidInput.at("", message, file=edit.path)
-        entry = person_change.consequence(repo, edit)
-        if entry.state == "matches nothing":
-            errors.print(f"warning: {edit.path} has no effect on anything that is demanded now")
-        elif entry.state in ("held back", "expired"):
-            errors.print(f"warning: {edit.path} is {entry.state}, so it changes nothing now")
-        _carry_out(repo, edit, entry, options)
+            raise InvalidInput.at("", message, file=_path_of(name))
+        _carry_out(repo, name, override_text(name, fields), summary, options)
+
+
+def _path_of(name: str) -> str:
+    return f"{OVERRIDES_ROOT}/{name}.yaml"
 
 
 def override_text(name: str, fields: dict[str, Any], note: str = "") -> str:
     given = {key: value for key, value in fields.items() if value is not None}
-    return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given, note)
+    return document(_path_of(name), "override", "Override", given, note)
 
 
-def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
+def end_override(repo: Reader, name: str, summary: str, options: EditOptions) -> None:
     overrides = repo.snapshot().state.config.overrides
-    if edit.name not in overrides and repo.file_reader()(edit.path) is not None:
+    if name not in overrides and repo.file_reader()(_path_of(name)) is not None:
         message = "is not valid, so nothing is overridden; correct or remove the file with git"
-        raise InvalidInput.at("", message, file=edit.path)
-    if edit.name not in overrides:
-        message = f"there is no override '{edit.name}'{suggestion(edit.name, overrides)}"
+        raise InvalidInput.at("", message, file=_path_of(name))
+    if name not in overrides:
+        message = f"there is no override '{name}'{suggestion(name, overrides)}"
         raise InvalidInput.at("", message)
-    _carry_out(repo, edit, person_change.consequence(repo, edit), options)
+    _carry_out(repo, name, None, summary, options)
 
 
-def _carry_out(repo: Reader, edit: Edit, entry: Entry, options: EditOptions) -> None:
+def _carry_out(
+    repo: Reader, name: str, text: str | None, summary: str, options: EditOptions
+) -> None:
+    # without a text, the override's file is removed
+    with progress("reading the ledger") as report:
+        state = repo.snapshot(progress=report).state
+    overrides, path = dict(state.config.overrides), _path_of(name)
+    if text is not None:
+        overrides[name] = Override.from_file(name, parse_file(OverrideFile, text, path))
+    # as if a new override were on main, and while one that ends still is
+    world = World(replace(state.config, overrides=overrides), state.ledger)
+    report_now = override_report(world, REAL.now())
+    entry = next(entry for entry in report_now if entry.override.name == name)
+    if text is not None and entry.state == "matches nothing":
+        errors.print(f"warning: {path} has no effect on anything that is demanded now")
+    elif text is not None and entry.state in ("held back", "expired"):
+        errors.print(f"warning: {path} is {entry.state}, so it changes nothing now")
     if options.output == "text":
-        errors.print(f"{edit.summary} ({edit.path})")
-        verb = "affects" if edit.text is not None else "no longer affects"
+        errors.print(f"{summary} ({path})")
+        verb = "affects" if text is not None else "no longer affects"
         lines = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
         lines += [f"  {verb} {claim.subject} of demand {claim.demand}" for claim in entry.claims]
         for line in lines or ["  affects nothing now"]:
             errors.print(line)
-    published = None
+    data: Json = {
+        "outcome": "would-change",
+        "commit": None,
+        "branch": None,
+        "link": None,
+        "text": text,
+        "override": json_output.override_data(entry.override),
+        "state": entry.state,
+        "releases": [json_output.release_data(release) for release in entry.releases],
+        "claims": [json_output.claim_data(claim) for claim in entry.claims],
+    }
+    lines = [f"{summary}: nothing was changed"]
+    lines += [f"    {line}" for line in (text or "").splitlines()]
     if not options.dry_run:
         person_change.confirm("Continue?", options.yes, options.output)
-        published = person_change.carry_out(repo, edit, options.propose)
-    person_change.print_edit(edit, entry, published, options.output)
+        published = _published(repo, name, {path: text}, summary, options)
+        data |= {
+            "outcome": "proposed" if options.propose else "committed",
+            "commit": published.commit,
+            "branch": published.branch,
+            "link": published.link or None,
+        }
+        lines = [
+            f"{summary}: commit {published.commit} on {MAIN_BRANCH}",
+            "a running generator carries out this commit, or else the next generator that starts",
+            *target.hint_to_pull(),
+        ]
+        if options.propose:
+            lines = [f"{summary}: merge {published.branch} {published.link}".rstrip()]
+    json_output.show(options.output, data, lines)
+
+
+def _published(
+    repo: Reader, name: str, files: dict[str, str | None], summary: str, options: EditOptions
+) -> Published:
+    who, reason = person_change.warned_if_unnamed(repo.operator()), one_line(options.reason)
+    details = CommitDetails(who, REAL.now(), summary, reason)
+    if not options.propose:
+        committed = person_commit.commit_to_main(repo.repository, files, details)
+        done.append(f"commit {committed.commit} on {MAIN_BRANCH}")
+        return committed
+    branch, title = f"override/{name}", harmless(one_line(summary))
+    proposals = repo.snapshot().state.config.repo_settings.proposals
+    # only GitLab opens a merge request for a push
+    push_options = merge_request(title, reason) if proposals.forge == "gitlab" else []
+    pushed = person_commit.commit_to_branch(repo.repository, files, details, branch, push_options)
+    done.append(f"commit {pushed.commit} on {branch}")
+    link = pushed.link
+    try:
+        if not link and (forge := forge_for(proposals, settings.forge_token_file())):
+            link = forge.open(branch, MAIN_BRANCH, title, reason).link
+    except ForgeError as error:  # the branch is there, so a person can open the merge request
+        errors.print(f"warning: no merge request was opened: {error}; open one for {branch}")
+    return Published(pushed.commit, branch, link)
 
 
 def ends_at(text: str | None) -> str | None:
@@ -239,13 +375,13 @@ def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
 
 
 @click.command()
-@person_change.selecting
+@selecting
 @click.option(
     "--expires",
     metavar="TIME",
     help="When the suspension ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
 )
-@person_change.editing
+@editing
 def suspend(expires: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
     """Stop applications and connections; their claims stay booked.
 
@@ -277,8 +413,8 @@ def described(selected: dict[str, tuple[str, ...]]) -> str:
 
 @click.command()
 @click.argument("name", required=False, metavar="[NAME]", shell_complete=names_of("overrides"))
-@person_change.selecting
-@person_change.editing
+@selecting
+@editing
 def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
     """Run suspended applications and connections again.
 
@@ -295,12 +431,12 @@ def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) 
             "give either the options of `demandops suspend`, or the override's name"
         )
     summary = f"Resume {name or described(selected)}"
-    edit = Edit(name or name_of(selected), None, summary, options.reason)
+    own = name or name_of(selected)
     with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
         overrides = repo.snapshot().state.config.overrides
-        override = overrides.get(edit.name)
+        override = overrides.get(own)
         # a person may have changed what the file selects since it was suspended
         if override and not name and not selects(override, selected):
-            message = f"selects something else; to end it, run: demandops resume {edit.name}"
-            raise InvalidInput.at("select", message, file=edit.path)
-        end_override(repo, edit, options)
+            message = f"selects something else; to end it, run: demandops resume {own}"
+            raise InvalidInput.at("select", message, file=_path_of(own))
+        end_override(repo, own, summary, options)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import click
 
-from demandops.cli.json_output import Json, output_option, show, time_text
-from demandops.cli.output import at_option, progress, version_lines, warn_of_problems
+from demandops.cli.json_output import output_option, show, time_text
+from demandops.cli.output import at_option
+from demandops.cli.queries.diff import loaded
+from demandops.cli.queries.get import KINDS
 from demandops.cli.table import Table, column, joined, table_of
 from demandops.cli.target import state_repo_option
 from demandops.repo import reader
-from demandops.views.bookkeeping import as_data, carried_topics
+from demandops.views.bookkeeping import as_data
 from demandops.views.bookkeeping import bookkeeping as derive
 
 
@@ -28,9 +28,7 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
       demandops bookkeeping --at 14:03 -o json
     """
     with reader.opened(state_repo) as repo:
-        with progress("reading the ledger") as report:
-            snapshot = repo.snapshot(at, report)
-        warn_of_problems(repo, snapshot)
+        snapshot = loaded(repo, at)
     commit = str(snapshot.commit)
     data = as_data(derive(snapshot.state), commit)
     capacity = [
@@ -39,60 +37,20 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
         for name, amounts in resources.items()
     ]
     text: list[str | Table] = []
+    for name in ("services", "connections"):
+        columns = (*KINDS[name].columns, *KINDS[name].wide)
+        entries = [{"name": id, **entry} for id, entry in data[name].items()]
+        text += [table_of(columns, entries, None, title=name.title()), ""]
     for title, columns, items in (
-        ("Services", _SERVICES, _named(data["services"])),
-        ("Connections", _CONNECTIONS, _named(data["connections"])),
         ("Suspended", _SUSPENDED, data.get("suspended")),
         ("Capacity", _CAPACITY, capacity),
         ("Waiting for room", _WAITING, data.get("waiting")),
     ):
-        if items or title in ("Services", "Connections"):
-            text += [table_of(columns, items or (), title=title), ""]
+        if items:
+            text += [table_of(columns, items, title=title), ""]
     show(output, data, [*text, f"at {commit}"])
 
 
-def _named(entries: dict[str, Json]) -> list[Json]:
-    return [{"name": name, **entry} for name, entry in entries.items()]
-
-
-def _topics(topics: Mapping[str, list[str]], entry: Json) -> list[str]:
-    # a topic is followed by its requesters if the entry has others too
-    return [
-        topic if who == entry["requesters"] else f"{topic} ({', '.join(who)})"
-        for topic, who in topics.items()
-    ]
-
-
-_SERVICES = (
-    column("Service", "name"),
-    column(
-        "Kind",
-        lambda entry: [
-            entry["service"],
-            *(f"{name} = {value}" for name, value in entry["parameters"].items()),
-        ],
-        5,
-    ),
-    column("Version", version_lines, 4),
-    column("Node", "node", 1),
-    column("For", lambda entry: entry["source"] or entry["applications"], 3, wraps=True),
-    column(
-        "Takes in",
-        lambda entry: [
-            line for topics in entry["inputs"].values() for line in _topics(topics, entry)
-        ],
-        6,
-    ),
-    column("Requesters", joined("requesters"), 2, wraps=True),
-)
-_CONNECTIONS = (
-    column("Connection", "name"),
-    column("By", "type", 3),
-    column("From", "source", 1),
-    column("To", "target", 1),
-    column("Topics", lambda entry: _topics(carried_topics(entry), entry), 4),
-    column("Requesters", joined("requesters"), 2, wraps=True),
-)
 _SUSPENDED = (
     column("Subject", lambda claim: "{kind} {id}".format(**claim)),
     column("Demand", "demand", 3),

@@ -22,11 +22,10 @@ from demandops.cli.output import (
     at_option,
     errors,
     painted,
-    progress,
     version_lines,
     warn_of_not_rendered,
-    warn_of_problems,
 )
+from demandops.cli.queries.diff import loaded
 from demandops.cli.table import CellOf, Column, Table, column, joined, table_of
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.model.config.base_model import duration_text, parse_time, relative
@@ -59,8 +58,8 @@ class Source:
 
 class Kind:
     items: Callable[[Source], list[Json]]  # each with a ``name``
-    columns: Sequence[tuple[Column, CellOf]]
-    wide: Sequence[tuple[Column, CellOf]]  # further columns for `-o wide`
+    columns: Sequence[Column]
+    wide: Sequence[Column]  # further columns for `-o wide`
     # An item is listed if the option matches one of the values that its filter returns.
     filters: ClassVar[Mapping[str, Values]]
 
@@ -109,6 +108,14 @@ def _holds(item: Json, now: datetime) -> list[str]:
     return [*item["applications"], *item["connections"]]
 
 
+def _asked_topics(topics: Mapping[str, list[str]], item: Json) -> list[str]:
+    # a topic is followed by its requesters if the item has others too
+    return [
+        topic if who == item["requesters"] else f"{topic} ({', '.join(who)})"
+        for topic, who in topics.items()
+    ]
+
+
 def _ago(key: str) -> CellOf:
     return lambda item, now: relative(parse_time(item[key]), now) if item[key] else ""
 
@@ -128,14 +135,15 @@ def _key(name: str) -> Values:
 _COMMON = {"node": _key("nodes"), "requester": _key("requesters"), "domain": _key("domains")}
 
 
-def _subject_lines(item: Json) -> list[str]:
-    held_for = [f"held for {id}" for id in item["held_for"]]
-    return ["{kind} {id}".format(**item["subject"]), *held_for]
-
-
 class _Claims(Kind):
     columns = (
-        column("Subject", lambda item, now: _subject_lines(item)),
+        column(
+            "Subject",
+            lambda item, now: [
+                "{kind} {id}".format(**item["subject"]),
+                *(f"held for {id}" for id in item["held_for"]),
+            ],
+        ),
         column("Requesters", joined("requesters"), 1, wraps=True),
         column("State", "state", 2),
         column("Since", _ago("since"), 3),
@@ -176,7 +184,7 @@ class _Connections(Kind):
         column("To", "target", 1),
         column("Requesters", joined("requesters"), 3, wraps=True),
     )
-    wide = (column("Topics", lambda item, now: list(carried_topics(item))),)
+    wide = (column("Topics", lambda item, now: _asked_topics(carried_topics(item), item), 4),)
     filters = _COMMON | {"node": lambda item: [item["source"], item["target"]]}
 
     def items(self, source: Source) -> list[Json]:
@@ -184,10 +192,12 @@ class _Connections(Kind):
         return [
             {
                 "name": name,
-                "domains": demand_lists.domains_of([entry.source, entry.target], world.config),
-                **asdict(entry),
+                "domains": demand_lists.domains_of(
+                    [entry["source"], entry["target"]], world.config
+                ),
+                **entry,
             }
-            for name, entry in bookkeeping(world).connections.items()
+            for name, entry in bookkeeping(world)["connections"].items()
         ]
 
 
@@ -272,10 +282,7 @@ class _Nodes(Kind):
 
     def items(self, source: Source) -> list[Json]:
         world = source.snapshot.state
-        return [
-            {**asdict(node), "position": node.position.model_dump() if node.position else None}
-            for node in demand_lists.nodes(world, release_causes.releases(world))
-        ]
+        return demand_lists.nodes(world, release_causes.releases(world))
 
 
 class _Overrides(Kind):
@@ -367,11 +374,15 @@ class _Services(Kind):
     wide = (
         column(
             "Takes in",
-            lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
+            lambda item, now: [
+                line for topics in item["inputs"].values() for line in _asked_topics(topics, item)
+            ],
+            6,
         ),
         column(
             "Parameters",
             lambda item, now: [f"{name} = {value}" for name, value in item["parameters"].items()],
+            7,
         ),
     )
     filters = _COMMON | {"node": _key("node"), "application": _key("applications")}
@@ -381,10 +392,10 @@ class _Services(Kind):
         return [
             {
                 "name": name,
-                "domains": demand_lists.domains_of([service.node], world.config),
-                **asdict(service),
+                "domains": demand_lists.domains_of([service["node"]], world.config),
+                **service,
             }
-            for name, service in bookkeeping(world).services.items()
+            for name, service in bookkeeping(world)["services"].items()
         ]
 
 
@@ -507,9 +518,7 @@ def get(
 
 
 def _read_source(repo: Reader, at: str | None) -> Source:
-    with progress("reading the ledger") as report:
-        snapshot = repo.snapshot(at, report)
-    warn_of_problems(repo, snapshot)
+    snapshot = loaded(repo, at)
     not_rendered = repo.not_rendered(snapshot) if at is None else frozenset()
     warn_of_not_rendered(not_rendered)
     return Source(repo, snapshot, REAL.now(), not_rendered)
