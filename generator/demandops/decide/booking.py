@@ -17,7 +17,6 @@ from demandops.model.demand.demand import (
     Demand,
     Item,
     Operation,
-    Term,
 )
 from demandops.model.ledger.claim import Claim, ClaimKey, demand_id, requesters_of
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
@@ -128,7 +127,7 @@ def _route_conflicts(
 def book(
     ledger: Ledger,
     item: Item,
-    request: str,
+    request: Demand,
     key: ClaimKey,
     current: Claim | None,
     now: datetime,
@@ -136,13 +135,13 @@ def book(
     joined: bool = False,
 ) -> Ledger:
     """Book an item; ``current`` is the demand's claim on the same subject so far."""
-    lease = item.term.lease_from(now) if item.term else None
-    if item.term and current and current.lease:
-        lease = current.lease.renewed(item.term, now)
+    lease = item.lease
+    if lease and not request.awaits_approval:
+        lease = lease.started(now, current.lease if current else None)
     claim = Claim(
         held=item.held.booked(),
         demand=key.demand,
-        request=request,
+        request=request.id,
         requesters=tuple(sorted(set(item.requesters))),
         booked=now,
         lease=lease,
@@ -179,7 +178,7 @@ def join(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Change
                 f"{', '.join(requesters_of(others))}; use another id"
             )
             faults.append(fault("id", message, code="conflict"))
-        ledger = book(ledger, item, request.id, key, ledger.get(key), now, joined=True)
+        ledger = book(ledger, item, request, key, ledger.get(key), now, joined=True)
         keys.append(key)
     if faults:
         raise Refused(faults)
@@ -207,7 +206,7 @@ def put(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes
                     "of this demand between others; use a second connection id"
                 )
             faults.append(item.fault("id", message))
-        ledger = book(ledger, item, request.id, key, start.get(key), now)
+        ledger = book(ledger, item, request, key, start.get(key), now)
         keys.append(key)
     if faults:
         raise Refused(faults)
@@ -335,8 +334,8 @@ def renew_leases(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger
     start, held = ledger, claims_of(ledger, request)
     for claim in held:
         if claim.lease is not None:
-            term = Term(claim.lease.seconds, claim.lease.slack)
-            ledger = ledger.replace(claim.key, replace(claim, lease=claim.lease.renewed(term, now)))
+            renewed = claim.lease.started(now, claim.lease)
+            ledger = ledger.replace(claim.key, replace(claim, lease=renewed))
     return ledger, Changes(claims=claim_changes(start, ledger, [claim.key for claim in held]))
 
 

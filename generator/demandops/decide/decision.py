@@ -97,8 +97,8 @@ class Decision:
             # which domain it will get is open, so any in which it may wait counts
             put, config = waiting.put, self.state.config
             domains = (domain for domain in config.domains.values() if domain.when_full == "wait")
-            terms = (permission.term(put, domain) for domain in domains)
-            return min((term.seconds for term in terms if term), default=None)
+            leases = (permission.lease_in(domain, put) for domain in domains)
+            return min((lease.seconds for lease in leases if lease), default=None)
         claims = (
             self.state.ledger.claims_of_demand(self.request.demand) if self.request.demand else ()
         )

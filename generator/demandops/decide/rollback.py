@@ -12,7 +12,7 @@ from datetime import datetime
 
 from demandops.base.errors import Fault, Refused, fault
 from demandops.decide.admission import admission, permission
-from demandops.model.demand.demand import Demand, Item, Operation, Term
+from demandops.model.demand.demand import Demand, Item, Rollback
 from demandops.model.ledger.claim import Claim, path_of
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
 
@@ -20,18 +20,12 @@ _SHOWN = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Restoration(Demand):
-    """A person's request to restore the claims of the commit ``to``, which was made at ``made``."""
+class Restoration(Rollback):
+    """A rollback with the claims of the commit ``to``, which was made at ``made``."""
 
-    operation: Operation = "rollback"
     is_complete: bool = True
-    to: str = ""
     made: datetime | None = None
     claims: tuple[Claim, ...] = ()
-    drop_newer: bool = False
-    reason: str = ""
-    by: str = ""
-    email: str = ""
 
 
 def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
@@ -58,8 +52,7 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
     for change in changes:
         restored = change.after
         if restored and restored.lease:  # from now on, because its old end may have passed
-            lease = Term(restored.lease.seconds, restored.lease.slack).lease_from(now)
-            restored = replace(restored, lease=lease)
+            restored = replace(restored, lease=restored.lease.started(now))
         ledger = ledger.replace(change.key, restored)
     keys = [change.key for change in changes]
     return ledger, Changes(claims=claim_changes(start, ledger, keys))

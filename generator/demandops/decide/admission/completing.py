@@ -63,7 +63,12 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
     # before what depends on the connection: its lease, type, permission, quota and approval
     demand = carriers.with_carriers(demand, ledger, config)
     checkpoint()
-    demand = permission.with_lease_terms(demand, config)
+    homes = [(item, config.domain_of.get(item.held.home)) for item in demand.demanded]
+    leased = (
+        replace(item, lease=permission.lease_in(home, demand) if home else None)
+        for item, home in homes
+    )
+    demand = replace(demand, demanded=tuple(leased))
     demand = admission.with_chosen_types(demand, config, ledger.connection)
     if demand.operation == "join":
         demand = _without_impossible_routes(demand, config)

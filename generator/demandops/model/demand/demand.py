@@ -403,19 +403,6 @@ def _before_unstarted(moment: datetime) -> datetime:
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
-    seconds: int  # the requested lease
-    slack: int = 0
-    # the lease starts when a person approves the request, not when the request is received
-    on_approval: bool = False
-
-    def lease_from(self, now: datetime) -> Lease:
-        if self.on_approval:
-            return Lease(self.seconds, self.slack, UNSTARTED)
-        return Lease(self.seconds, self.slack, now + timedelta(seconds=self.seconds))
-
-
-@dataclass(frozen=True, slots=True)
 class Lease:
     __pydantic_config__: ClassVar = PART
 
@@ -427,11 +414,6 @@ class Lease:
     def has_started(self) -> bool:
         return self.until < UNSTARTED
 
-    def started(self, now: datetime, before: Lease | None = None) -> Lease:
-        term = Term(self.seconds, self.slack)
-        # the approval of a changed demand renews its lease, which never ends earlier than before
-        return before.renewed(term, now) if before else term.lease_from(now)
-
     @property
     def expires_at(self) -> datetime:
         return self.until + timedelta(seconds=self.slack)
@@ -439,14 +421,17 @@ class Lease:
     def has_ended(self, now: datetime) -> bool:
         return self.expires_at < now
 
-    def renewed(self, term: Term, now: datetime) -> Lease:
-        wanted = term.lease_from(now)
-        same_term = (self.seconds, self.slack) == (term.seconds, term.slack)
+    def started(self, now: datetime, before: Lease | None = None) -> Lease:
+        """Return the lease as it begins now, or as it renews the one that the claim had before."""
+        wanted = replace(self, until=now + timedelta(seconds=self.seconds))
+        if before is None:
+            return wanted
+        same_term = (self.seconds, self.slack) == (before.seconds, before.slack)
         # a thousand vehicles renew every few minutes, and not each renewal may make a commit
-        if same_term and wanted.until <= self.expires_at:
-            return self
+        if same_term and wanted.until <= before.expires_at:
+            return before
         # the end never moves to an earlier time, because the clock may have been set back
-        return replace(wanted, until=max(wanted.until, self.until))
+        return replace(wanted, until=max(wanted.until, before.until))
 
 
 # ---- demands ----
@@ -467,7 +452,7 @@ class Item:
     # connection. Of one that the demand does not list, all faults are reported there.
     places: tuple[str, ...] = ()
     is_listed: bool = True
-    term: Term | None = None
+    lease: Lease | None = None  # which has not started
     # a sentence for each placed application or service: which node was chosen, and why
     placed: tuple[str, ...] = ()
 
@@ -512,6 +497,8 @@ class Demand:
     priority: int = 0  # among the demands that wait for room
     # Whether it has all that a demand may leave open, and is admitted. The generator's own are.
     is_complete: bool = False
+    # its leases start when a person approves it, not when it is received
+    awaits_approval: bool = False
     # how what is booked differs from what was demanded, for warnings in the receipt
     notes: tuple[str, ...] = ()
     # the goal as plain data, which the journal keeps
