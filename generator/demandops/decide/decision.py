@@ -439,8 +439,8 @@ def notes_on(
         if isinstance(item.held, Application):
             for flow in flows_without_carrier(after.config, item.held, ledger):
                 yield (
-                    f"application '{item.held.id}': no connection carries {flow.topic} "
-                    f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
+                    f"application '{item.held.id}': no connection carries {flow.key.topic} "
+                    f"({flow.name}) of '{flow.key.sender}' to '{flow.key.receiver}'"
                 )
     yield from request.notes
     for change in changes.claims:

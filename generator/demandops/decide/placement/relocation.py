@@ -203,7 +203,7 @@ def _moved(
             for _, route in carriers.carrying(world.ledger, claim.demand, flow):
                 # On the sender's own node, no connection would rename the topic.
                 renamed = flow.delivery is None and route.read_topic != route.written_topic
-                if renamed and flow.sender == chosen.node:
+                if renamed and flow.key.sender == chosen.node:
                     message = (
                         f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
                     )

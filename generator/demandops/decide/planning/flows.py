@@ -153,18 +153,14 @@ class PublishedTopic(NamedTuple):
 class Flow:
     """A topic that is made on one node and needed on another node.
 
-    ``name`` is an input role of the application, or ``<service>.<output>``. ``target`` is the
-    topic's name at the receiver. ``root`` is the key of the demanded topic because of which the
-    flow is needed; it is empty for a delivery, and if no single topic needs the flow. ``delivery``
-    is the position in ``deliver`` of the delivery that needs the flow. ``type`` is the message
-    type; it is empty unless the demand names the type.
+    ``name`` is an input role of the application, or ``<service>.<output>``. ``root`` is the key of
+    the demanded topic because of which the flow is needed; it is empty for a delivery, and if no
+    single topic needs the flow. ``delivery`` is the position in ``deliver`` of the delivery that
+    needs the flow. ``type`` is the message type; it is empty unless the demand names the type.
     """
 
     name: str
-    topic: str
-    sender: str
-    receiver: str
-    target: str
+    key: RouteKey
     root: TopicKey = ()
     delivery: int | None = None
     type: str = ""
@@ -244,25 +240,24 @@ def flows(config: Config, app: Application) -> list[Flow]:
     """Return the flows between nodes by ``name``; a node that is not chosen yet is empty."""
     services = config.services.get(app.appdef, {})
     # Several services of one node may read a topic, but it must come to the node only once.
-    needed: dict[tuple[str, str, str, str], Flow] = {}
+    needed: dict[RouteKey, Flow] = {}
     for service in services.values():
         for node, part in _parts(app, service):
             for origin in service.inputs.values():
                 for topic, sender, root in topics_of_origin(config, part, origin):
                     if sender != node:
                         cause = root or (next(part.topic_keys()) if service.roots else ())
-                        name = topic.topic
-                        flow = Flow(origin, name, sender, node, name, cause, type=topic.type)
-                        needed.setdefault((name, sender, node, name), flow)
+                        key = RouteKey(sender, topic.topic, node, topic.topic)
+                        needed.setdefault(key, Flow(origin, key, cause, type=topic.type))
     for index, delivery in enumerate(app.deliver):
         producer, _, output = delivery.output.partition(".")
         if producer not in services or output not in services[producer].outputs:
             continue  # admission reports an unknown output
         for topic, sender, _ in topics_of_origin(config, app, delivery.output):
-            name, target = topic.topic, delivery.topic or topic.topic
-            if (sender, name) != (delivery.node, target):
-                flow = Flow(delivery.output, name, sender, delivery.node, target, delivery=index)
-                needed.setdefault((name, sender, delivery.node, target), flow)
+            target = delivery.topic or topic.topic
+            key = RouteKey(sender, topic.topic, delivery.node, target)
+            if key[:2] != key[2:]:
+                needed.setdefault(key, Flow(delivery.output, key, delivery=index))
     return sorted(needed.values(), key=lambda flow: flow.name)
 
 
@@ -291,10 +286,8 @@ def is_bridged(key: RouteKey, config: Config) -> bool:
 
 def flows_without_carrier(config: Config, app: Application, ledger: Ledger) -> Iterator[Flow]:
     for flow in flows(config, app):
-        key = RouteKey(flow.sender, flow.topic, flow.receiver, flow.target)
-        if not ledger.ids_with("brings", flow.receiver, flow.target) and not is_bridged(
-            key, config
-        ):
+        is_brought = ledger.ids_with("brings", flow.key.receiver, flow.key.target)
+        if not is_brought and not is_bridged(flow.key, config):
             yield flow
 
 
