@@ -16,7 +16,7 @@ from typing import Literal, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.connections.connection import ClientKey
-from demandops.decide import carriers, changeset, rollback, warnings
+from demandops.decide import carriers, changeset, warnings
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.completing import (
     completed,
@@ -24,7 +24,7 @@ from demandops.decide.admission.completing import (
     with_definitions,
     with_separate_instances,
 )
-from demandops.decide.booking import Drain, apply
+from demandops.decide.booking import Drain, Restoration, apply, restoration_faults
 from demandops.decide.changeset import Changeset, FileReader, PlannedChange, ReleaseChange
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.forbidden import Difference
@@ -34,7 +34,6 @@ from demandops.decide.placement.capacity import Need
 from demandops.decide.planning.flows import flows_without_carrier, without_idle_holds
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.release_keys import affected_keys
-from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Application, Demand
@@ -314,7 +313,7 @@ def _booked(
         united, _ = carriers.with_one_carrier(ledger_of(request.claims))
         request = replace(request, claims=tuple(united))
         request = relocation.with_restored_moves(request, state)
-        if faults := list(rollback.faults(request, state)):
+        if faults := list(restoration_faults(request, state)):
             raise Refused(faults)
     checkpoint()
     if strangers := list(permission.owner_faults(request, state.ledger, state.config)):

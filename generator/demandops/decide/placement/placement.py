@@ -187,7 +187,7 @@ class _Places(Generic[_Result]):
     def _place_application(
         self, index: int, item: Item, app: Application, place: Requirement
     ) -> None:
-        choice = self._choice(item, place)
+        choice = Choice(item, place, self._room, None, self._request.positions)
         if app.node:
             # ``node`` and ``place`` together are a check of the named node, and no preference.
             node = choice.config.nodes.get(app.node)
@@ -253,7 +253,8 @@ class _Places(Generic[_Result]):
         return booked if booked and booked.appdef == app.appdef else None
 
     def _place_service(self, index: int, service: Service) -> None:
-        choice = self._choice(self._demanded[index], requirement_of(service), service)
+        item, positions = self._demanded[index], self._request.positions
+        choice = Choice(item, requirement_of(service), self._room, service, positions)
         first = self._booked_as(choice.app)
         here = first.services.get(service.name, "") if first else ""
         shared = _shared_node(choice.app, service, self._state)
@@ -263,11 +264,6 @@ class _Places(Generic[_Result]):
         elif shared and choice.has_room(shared):
             chosen = Chosen(shared, "where the service already runs for this topic")
         self._take(index, choice, chosen)
-
-    def _choice(
-        self, item: Item, requirement: Requirement, service: Service | None = None
-    ) -> Choice:
-        return Choice(item, requirement, self._room, service, self._request.positions)
 
     def _take(self, index: int, choice: Choice, chosen: Chosen | None) -> None:
         """Put the application or service on ``chosen``, or else on the first node that will do."""

@@ -43,7 +43,7 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
     roles = {role for appdef in config.appdefs.values() for role in appdef.inputs}
     folders: dict[str, str] = {}
     for node in config.nodes.values():
-        file, place = reader.place_of(configs.NODES_FILE, node.id)
+        file, place = reader.places[configs.NODES_FILE][node.id]
         other = folders.setdefault(folder := naming.object_name("", node.id), node.id)
         if other != node.id:
             message = f"'{other}' has the folder {folder} too; choose another id"
@@ -63,7 +63,7 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
                 message = f"'{role}' is not an input of any application{suggestion(role, roles)}"
                 reader.add_fault(file, f"{place}.topics.{role}", message)
     for broker in config.brokers.values():
-        file, place = reader.place_of(configs.BROKERS_FILE, broker.node)
+        file, place = reader.places[configs.BROKERS_FILE][broker.node]
         reader.check_reference(file, f"{place}.node", broker.node, configs.NODES_FILE)
 
 
@@ -71,7 +71,7 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
     argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
     seen: dict[str, str] = {}
     for domain in config.domains.values():
-        file, place = reader.place_of(configs.DOMAINS_FILE, domain.name)
+        file, place = reader.places[configs.DOMAINS_FILE][domain.name]
         if domain.broker is not None:
             reader.check_reference(file, f"{place}.broker", domain.broker, configs.BROKERS_FILE)
         for broker in domain.broker_credentials:
@@ -96,7 +96,7 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
     for node in config.nodes.values():
         domain = config.domain_of.get(node.id)
         if domain and domain.pod_security == "baseline" and node.host_network:
-            file, place = reader.place_of(configs.NODES_FILE, node.id)
+            file, place = reader.places[configs.NODES_FILE][node.id]
             message = (
                 f"is true (the default), and podSecurity of access domain '{domain.name}' is "
                 "baseline, which forbids it; set 'hostNetwork: false' or "
@@ -115,7 +115,7 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
 
 def _check_charts(config: Config, reader: ConfigReader) -> None:
     for name, chart in config.charts.items():
-        file, place = reader.place_of(configs.CHARTS_FILE, name)
+        file, place = reader.places[configs.CHARTS_FILE][name]
         _check_chart(file, place, chart, config, reader)
         for channel, source in chart.channels.items():
             _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
@@ -232,7 +232,7 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
 def _check_versions(config: Config, reader: ConfigReader) -> None:
     for name, appdef in config.appdefs.items():
         # an invalid entry may be the missing one
-        is_unlisted = not reader.files_of(configs.VERSIONS_FILE) or reader.is_missing(
+        is_unlisted = not reader.files_of[configs.VERSIONS_FILE] or reader.is_missing(
             configs.VERSIONS_FILE, name
         )
         if appdef.versions != "refuse" and is_unlisted:
@@ -244,7 +244,7 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
         if appdef.versions == "separate":
             _check_separate(name, config, reader)
     for name, listed in config.versions.items():
-        file, place = reader.place_of(configs.VERSIONS_FILE, name)
+        file, place = reader.places[configs.VERSIONS_FILE][name]
         if name not in config.appdefs:
             # an appdef.yaml that exists but is invalid has faults of its own
             if f"appdefs/{name}/appdef.yaml" not in reader.files:
@@ -332,7 +332,7 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
                 override.node in config.nodes
                 and override.node not in config.domain_of
                 and config.domains
-                and reader.is_complete(configs.DOMAINS_FILE)
+                and configs.DOMAINS_FILE not in reader.incomplete
                 # a node that several domains match is in none, and has a fault of its own
                 and not any(matches(override.node, d.nodes) for d in config.domains.values())
             ):

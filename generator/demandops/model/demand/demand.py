@@ -41,7 +41,7 @@ from demandops.model.config.inventory import Position, read_condition
 # ---- applications ----
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, order=True)
 class InputTopic:
     """An input topic of an application, and the node that publishes it.
 
@@ -62,10 +62,6 @@ class InputTopic:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "topic", absolute_topic(self.topic))
-
-    @property
-    def order(self) -> tuple[str, str, str, bool, str, str]:
-        return self.topic, self.source, self.type, self.further, self.application, self.output
 
     def part_in(self, version: str) -> str:
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
@@ -102,10 +98,6 @@ def _property_problem(text: str) -> str:
     return f"{quoted(text)} is not a property; write name=value, name>=8 or name<=8"
 
 
-def _capability_problem(text: str) -> str:
-    return "" if text else "is empty; name a capability, or leave it out"
-
-
 @dataclass(frozen=True, slots=True)
 class Requirement:
     """Requirements on a node; ``labels`` are texts like ``zone=north``.
@@ -117,7 +109,11 @@ class Requirement:
 
     role: str = ""
     labels: Items[Annotated[str, without(_label_problem)]] = ()
-    capabilities: Items[Annotated[str, without(_capability_problem)]] = ()
+    capabilities: Items[
+        Annotated[
+            str, without(lambda t: "" if t else "is empty; name a capability, or leave it out")
+        ]
+    ] = ()
     properties: Items[Annotated[str, without(_property_problem)]] = ()
 
     @property
@@ -164,10 +160,6 @@ def _read_connect(value: object) -> object:
     return value if isinstance(value, dict | Connect) else Connect(_CONNECT.func(value))  # type: ignore[call-arg]
 
 
-def _written_connect(connect: Connect) -> object:
-    return {"type": connect.type, "broker": connect.broker} if connect.broker else connect.type
-
-
 @dataclass(frozen=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     """One application: its id, type (the name of an appdef), node and inputs by role.
@@ -190,7 +182,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         BeforeValidator(
             _read_connect, json_schema_input_type=_CONNECT.json_schema_input_type | Connect
         ),
-        PlainSerializer(_written_connect),
+        PlainSerializer(lambda c: {"type": c.type, "broker": c.broker} if c.broker else c.type),
     ] = Connect()
     deliver: Items[Delivery] = ()
     # The requirements on the node, kept to choose again; None if the demand names the node. A place
