@@ -36,7 +36,7 @@ from demandops.decide.planning.overrides import update_kept_claims, without_susp
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import State
 from demandops.model.config.config import Config
-from demandops.model.demand.demand import Application, Demand
+from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import goal_field, read_goal
 from demandops.model.ledger.claim import demand_id
 from demandops.model.ledger.ledger import Changes, World, claim_changes, ledger_of
@@ -428,19 +428,18 @@ def _once(*texts: str) -> tuple[str, ...]:
 def notes_on(
     request: Demand, before: World, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
-    for item in request.demanded:
-        if isinstance(item.held, Application) and item.held.separate:
-            id, _, version = item.held.id.rpartition("@")
-            yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"
+    for app in request.applications:
+        if app.separate:
+            id, _, version = app.id.rpartition("@")
+            yield f"application '{id}' in version {version} runs separately, as '{app.id}'"
     # a connection that an override denies carries nothing
     ledger = without_suspended(after).ledger
-    for item in request.demanded if request.adds_claims else ():
-        if isinstance(item.held, Application):
-            for flow in flows_without_carrier(after.config, item.held, ledger):
-                yield (
-                    f"application '{item.held.id}': no connection carries {flow.key.topic} "
-                    f"({flow.name}) of '{flow.key.sender}' to '{flow.key.receiver}'"
-                )
+    for app in request.applications if request.adds_claims else ():
+        for flow in flows_without_carrier(after.config, app, ledger):
+            yield (
+                f"application '{app.id}': no connection carries {flow.key.topic} ({flow.name}) of "
+                f"'{flow.key.sender}' to '{flow.key.receiver}'"
+            )
     yield from request.notes
     for change in changes.claims:
         if change.after and not change.after.is_on_application:

@@ -29,10 +29,6 @@ class Autoscaler:
         by = ", ".join(f"{name} {percent} %" for name, percent in self.targets.items())
         return f"{self.min} to {self.max} by an autoscaler ({by})"
 
-    def values(self) -> dict[str, int]:
-        targets = {str(name): percent for name, percent in self.targets.items()}
-        return {"min": self.min, "max": self.max} | targets
-
 
 def most_replicas(replicas: int | Autoscaler) -> int:
     return replicas.max if isinstance(replicas, Autoscaler) else replicas

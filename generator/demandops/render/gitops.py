@@ -192,8 +192,9 @@ def _variables(release: ServiceRelease, config: Config) -> dict[str, object]:
     }
     # Never both. A template that knows only ``replicas`` must fail, because the GitOps controller
     # would set back what the autoscaler writes.
-    if release.autoscaler:
-        variables["autoscaler"] = release.autoscaler.values()
+    if scaler := release.autoscaler:
+        targets = {str(name): percent for name, percent in scaler.targets.items()}
+        variables["autoscaler"] = {"min": scaler.min, "max": scaler.max, **targets}
     else:
         variables["replicas"] = release.replicas
     if release.key.application is not None:
@@ -210,12 +211,6 @@ def _variables(release: ServiceRelease, config: Config) -> dict[str, object]:
 
 
 def render_connection(client: Client, config: Config) -> str:
-    """Return the manifests of a client as one YAML text.
-
-    Raises:
-        InvalidInput: if an override's patch gives no valid settings.
-        Refused: if the registry has no image for the client.
-    """
     kind, node = client.type, client.node
     if kind.image not in config.images:
         message = (

@@ -212,13 +212,7 @@ def _chosen(
 
 
 def with_separate_instances(request: AnyDemand, config: Config) -> AnyDemand:
-    demanded = (
-        replace(item, held=_separated(item.held, config))
-        if isinstance(item.held, Application) and item.held.version
-        else item
-        for item in request.demanded
-    )
-    return replace(request, demanded=tuple(demanded))
+    return request.with_each(lambda app: _separated(app, config) if app.version else app)
 
 
 def _separated(app: Application, config: Config) -> Application:

@@ -45,7 +45,7 @@ def topic_faults(
     for key in keys:
         if isinstance(key, ServiceKey) and not is_needed(before, key):
             yield from islice(_clashes_of_service(request, after, key), 1)
-    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
+    apps = request.applications
     chosen = any(app.place or {*app.services} - {*app.named} for app in apps)
     for item in request.demanded:
         connection = item.held

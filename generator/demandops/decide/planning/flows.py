@@ -90,20 +90,13 @@ def with_further_topics(request: AnyDemand, ledger: Ledger, config: Config) -> A
             usual = first.setdefault(place, topic.topic)
         return topic.topic != usual
 
-    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
     # A usual topic that is booked stays the usual one, even if the request lists it after others.
-    for app, role in product(apps, config.roles_with_services):
+    for app, role in product(request.applications, config.roles_with_services):
         for topic in app.inputs.get(role, ()):
             booked = ledger.booked_input(role, topic.source, topic.topic)
             if booked is not None and not booked.further:
                 first.setdefault((role, topic.source), topic.topic)
-    demanded = (
-        replace(item, held=_marked(item.held, config, is_further))
-        if isinstance(item.held, Application)
-        else item
-        for item in request.demanded
-    )
-    return replace(request, demanded=tuple(demanded))
+    return request.with_each(lambda app: _marked(app, config, is_further))
 
 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
@@ -300,7 +293,7 @@ def flows_without_carrier(config: Config, app: Application, ledger: Ledger) -> I
 
 
 def reads_outputs(request: Demand) -> bool:
-    return request.adds_claims and any(app.read_outputs for app in _listed(request).values())
+    return request.adds_claims and any(app.read_outputs for app in request.applications)
 
 
 def with_topics_of_outputs(
@@ -367,8 +360,7 @@ def with_topics_of_outputs(
 
 
 def _listed(request: Demand) -> dict[str, Application]:
-    apps = (item.held for item in request.demanded if isinstance(item.held, Application))
-    return {app.id: app for app in apps}
+    return {app.id: app for app in request.applications}
 
 
 def _with_topics(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 from bisect import bisect_left
-from collections.abc import Container, Hashable, Iterator, Mapping
+from collections.abc import Callable, Container, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta, timezone
 from functools import cached_property
@@ -509,6 +509,19 @@ class Demand:
     def is_release(self) -> bool:  # by the party that demanded
         return self.operation in ("release", "shutdown")
 
+    @property
+    def applications(self) -> tuple[Application, ...]:
+        helds = (item.held for item in self.demanded)
+        return tuple(held for held in helds if isinstance(held, Application))
+
+    def with_each(self: AnyDemand, change: Callable[[Application], Application]) -> AnyDemand:
+        """Return the demand with a change of each application."""
+        demanded = (
+            replace(item, held=change(item.held)) if isinstance(item.held, Application) else item
+            for item in self.demanded
+        )
+        return replace(self, demanded=tuple(demanded))
+
     def requesters(self) -> tuple[str, ...]:
         listed = (who for item in self.demanded for who in item.requesters)
         return tuple(dict.fromkeys((*self.own_requesters, *listed)))
@@ -518,7 +531,7 @@ class Demand:
 
     def listed_subjects(self) -> set[Subject]:
         """Return the subjects that the goal lists, whatever connections carry their topics."""
-        listed = {item.held.subject for item in self.demanded if isinstance(item.held, Application)}
+        listed = {app.subject for app in self.applications}
         for item in self.demanded:
             for route in item.held.topics if isinstance(item.held, Connection) else ():
                 if not route.implied:
@@ -530,8 +543,8 @@ class Demand:
         """Return what keeps demands that share it in their order; None touches everything."""
         if self.operation in ("decommission", "rollback"):
             return None
-        apps = (item.held for item in self.demanded if isinstance(item.held, Application))
-        read = (Subject(SubjectKind.APPLICATION, id) for app in apps for id in app.read_outputs)
+        ids = (id for app in self.applications for id in app.read_outputs)
+        read = (Subject(SubjectKind.APPLICATION, id) for id in ids)
         own = [("demand", self.demand)] if self.demand else []
         return frozenset((*self.subjects(), *read, *own))
 

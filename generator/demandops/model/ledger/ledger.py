@@ -25,6 +25,7 @@ from demandops.model.ledger.records import WaitingDemands
 # A :class:`Ledger` never changes, because each request makes a new one.
 
 _DEMAND = attrgetter("demand")
+_BY_SUBJECT = attrgetter("subject.kind.value", "subject.id", "demand")
 
 Entry: TypeAlias = "tuple[str, ...]"
 # The first word of an entry: by what a claim is found. The further words name it.
@@ -112,17 +113,14 @@ class Ledger:
         return (claim for key in self.keys_with(by, *words) if (claim := self.get(key)))
 
     def claims_with(self, by: By, *words: str) -> tuple[Claim, ...]:
-        return self.claims_at(self.keys_with(by, *words))
-
-    def claims_at(self, keys: Iterable[ClaimKey]) -> tuple[Claim, ...]:
-        by_subject = attrgetter("subject.kind.value", "subject.id", "demand")
-        return tuple(c for key in sorted(keys, key=by_subject) if (c := self.get(key)))
+        keys = sorted(self.keys_with(by, *words), key=_BY_SUBJECT)
+        return tuple(claim for key in keys if (claim := self.get(key)))
 
     def claims_needing(self, node: str) -> tuple[Claim, ...]:
         keys = {*self.keys_with("node", node), *self.keys_with("broker", node)}
         for kind in connection_types.CONNECTION_TYPES:
             keys |= {*self.keys_with("link", kind.name, node)}
-        return self.claims_at(keys)
+        return tuple(c for key in sorted(keys, key=_BY_SUBJECT) if (c := self.get(key)))
 
     def subjects(self, kind: SubjectKind) -> list[str]:
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
