@@ -80,8 +80,7 @@ def faults(request: Demand, config: Config) -> Iterator[Fault]:
 
 
 def items_of(request: Demand) -> int:
-    items = len(request.own_requesters)
-    items += len(request.positions)
+    items = len(request.own_requesters) + len(request.positions)
     for item in request.demanded:
         held = item.held
         if isinstance(held, Application):

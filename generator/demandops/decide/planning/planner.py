@@ -130,13 +130,14 @@ def _parts(
             continue
         roles = service.roots or {role for app in same for role in app.inputs}
         inputs = {
-            role: {topic for app in same for topic in app.inputs.get(role, ())} for role in roles
-        }
-        if service.roots:
-            inputs = {
-                role: {topic for topic in topics if topic.source == key.node}
-                for role, topics in inputs.items()
+            role: {
+                topic
+                for app in same
+                for topic in app.inputs.get(role, ())
+                if not service.roots or topic.source == key.node
             }
+            for role in roles
+        }
         yield first.with_inputs({role: tuple(topics) for role, topics in inputs.items()})
 
 
