@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 from demandops.decide.state import State
-from demandops.model.config import override_conflicts
+from demandops.model.config import cross_check
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.override import Override, Selector
 from demandops.model.ledger.ledger import Ledger
@@ -67,10 +67,9 @@ def may_select_same_release(
     one: Iterable[Selector], other: Iterable[Selector], config: Config
 ) -> bool:
     """Return whether some release may match selectors of both overrides, by comparing all pairs."""
-    shares = override_conflicts.shares_any_clients(config)
+    shares = cross_check.shares_any_clients(config)
     return any(
-        override_conflicts.may_match_same_release(*pair, config, shares)
-        for pair in product(one, other)
+        cross_check.may_match_same_release(*pair, config, shares) for pair in product(one, other)
     )
 
 

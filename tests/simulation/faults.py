@@ -129,12 +129,14 @@ def end_the_whole_claim_by_a_shutdown_of_some_topics(_: Any, claim: Any, gone: A
     return None
 
 
-@wrong(15, Lease, "renewed")
-def take_back_promised_leases(_: Any, lease: Any, term: Any, now: Any) -> Any:
-    return term.lease_from(now)
+@wrong(5, Lease, "started")
+def take_back_promised_leases(started: Any, lease: Any, now: Any, before: Any = None) -> Any:
+    return started(lease, now)
 
 
-plant("lose_renewals", 3, Lease, "renewed", itself)
+@wrong(2, Lease, "started")
+def lose_renewals(started: Any, lease: Any, now: Any, before: Any = None) -> Any:
+    return before or started(lease, now)
 
 
 plant("end_leases_by_the_wall_clock", 11, Agenda, "_has_grace", lambda *_: False)

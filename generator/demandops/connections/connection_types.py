@@ -58,10 +58,8 @@ _ALWAYS = ("type", "reverse")
 
 
 def choose_type(connection: Connection, config: Config) -> ConnectionType | None:
-    for kind in CONNECTION_TYPES:
-        if next(type_faults(kind, connection, config), None) is None:
-            return kind
-    return None
+    fitting = (kind for kind in CONNECTION_TYPES if not any(type_faults(kind, connection, config)))
+    return next(fitting, None)
 
 
 def no_type_fault(connection: Connection, config: Config) -> Fault:

@@ -32,7 +32,7 @@ class Zenoh(routes.ConnectionType):
         for node in config.nodes.values():
             host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
             if node.zenoh and (other := hosts.setdefault(host, node.id)) != node.id:
-                file, place = reader.place_of(NODES_FILE, node.id)
+                file, place = reader.places[NODES_FILE][node.id]
                 yield fault(
                     f"{place}.zenoh",
                     f"'{other}' already runs a bridge on the same host and ROS domain; remove one "

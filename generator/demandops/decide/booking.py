@@ -7,20 +7,20 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 
 from demandops.base.errors import Fault, Refused, fault, suggestion
-from demandops.base.naming import Subject, SubjectKind, TopicKey
+from demandops.base.naming import Subject, TopicKey
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection, Route
-from demandops.decide.rollback import Restoration, restore
+from demandops.decide.admission import admission, permission
 from demandops.model.demand.demand import (
     Application,
     Decommission,
     Demand,
     Item,
     Operation,
-    Term,
+    Rollback,
 )
-from demandops.model.ledger.claim import Claim, ClaimKey, demand_id, requesters_of
-from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
+from demandops.model.ledger.claim import Claim, ClaimKey, demand_id, path_of, requesters_of
+from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
 from demandops.model.ledger.records import Wait
 
 
@@ -128,7 +128,7 @@ def _route_conflicts(
 def book(
     ledger: Ledger,
     item: Item,
-    request: str,
+    request: Demand,
     key: ClaimKey,
     current: Claim | None,
     now: datetime,
@@ -136,13 +136,13 @@ def book(
     joined: bool = False,
 ) -> Ledger:
     """Book an item; ``current`` is the demand's claim on the same subject so far."""
-    lease = item.term.lease_from(now) if item.term else None
-    if item.term and current and current.lease:
-        lease = current.lease.renewed(item.term, now)
+    lease = item.lease
+    if lease and not request.awaits_approval:
+        lease = lease.started(now, current.lease if current else None)
     claim = Claim(
         held=item.held.booked(),
         demand=key.demand,
-        request=request,
+        request=request.id,
         requesters=tuple(sorted(set(item.requesters))),
         booked=now,
         lease=lease,
@@ -179,7 +179,7 @@ def join(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Change
                 f"{', '.join(requesters_of(others))}; use another id"
             )
             faults.append(fault("id", message, code="conflict"))
-        ledger = book(ledger, item, request.id, key, ledger.get(key), now, joined=True)
+        ledger = book(ledger, item, request, key, ledger.get(key), now, joined=True)
         keys.append(key)
     if faults:
         raise Refused(faults)
@@ -207,7 +207,7 @@ def put(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes
                     "of this demand between others; use a second connection id"
                 )
             faults.append(item.fault("id", message))
-        ledger = book(ledger, item, request.id, key, start.get(key), now)
+        ledger = book(ledger, item, request, key, start.get(key), now)
         keys.append(key)
     if faults:
         raise Refused(faults)
@@ -335,8 +335,8 @@ def renew_leases(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger
     start, held = ledger, claims_of(ledger, request)
     for claim in held:
         if claim.lease is not None:
-            term = Term(claim.lease.seconds, claim.lease.slack)
-            ledger = ledger.replace(claim.key, replace(claim, lease=claim.lease.renewed(term, now)))
+            renewed = claim.lease.started(now, claim.lease)
+            ledger = ledger.replace(claim.key, replace(claim, lease=renewed))
     return ledger, Changes(claims=claim_changes(start, ledger, [claim.key for claim in held]))
 
 
@@ -362,7 +362,7 @@ def decommission(ledger: Ledger, request: Decommission) -> tuple[Ledger, Changes
     start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
     nodes = request.nodes or (request.id,)
     if "node" in request.kinds:
-        needing = (c for node in nodes for c in claims_needing(ledger, node))
+        needing = (c for node in nodes for c in ledger.claims_needing(node))
         claims |= {f"{c.subject} {c.demand}": c for c in needing}
     if "requester" in request.kinds:
         held = ledger.claims_of_requester(request.id)
@@ -388,17 +388,6 @@ def decommission(ledger: Ledger, request: Decommission) -> tuple[Ledger, Changes
     return ledger.without_waiting(waiting), Changes(claims=changes, waiting=waiting)
 
 
-def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
-    subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.ids_with("node", node)]
-    subjects += [Subject(SubjectKind.CONNECTION, id) for id in ledger.connections_needing(node)]
-    return [
-        claim
-        for subject in subjects
-        for claim in ledger.claims_on(subject)
-        if claim.held.needs(node)
-    ]
-
-
 @dataclass(frozen=True, slots=True)
 class Drain(Demand):
     """The generator's request to move what it placed on the drained node ``id``.
@@ -417,6 +406,93 @@ class Drain(Demand):
     moves: tuple[ClaimChange, ...] = ()
     moved: tuple[str, ...] = ()
     stays: tuple[str, ...] = ()
+
+
+# ---- a restoration books the claims of an earlier commit again ----
+#
+# It undoes newer claims only if the request says so. Afterwards, as after every change,
+# :mod:`.overrides` updates the claims that overrides keep.
+
+_MOST_SHOWN = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Restoration(Rollback):
+    """A rollback with the claims of the commit ``to``, which was made at ``made``."""
+
+    is_complete: bool = True
+    made: datetime | None = None
+    claims: tuple[Claim, ...] = ()
+
+
+def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
+    """Restore the claims; raise Refused if newer ones would change without ``drop_newer``."""
+    changes = _restored(ledger, request)
+    # claims that overrides keep do not count, because they are made again
+    newer = [(c, c.before) for c in changes if c.before and c.before.keeping_override is None]
+    if newer and not request.drop_newer:
+        refusals: list[Fault] = []
+        for change, claim in newer[:_MOST_SHOWN]:
+            effect = "drop" if change.after is None else "undo a change of"
+            message = (
+                f"would {effect} the claim of {', '.join(claim.requesters)} on {claim.subject}, "
+                f"booked {claim.booked:%Y-%m-%d %H:%M:%S} UTC (request '{claim.request}')"
+            )
+            refusals.append(fault("", message, code="newer").within(path_of(claim.key)))
+        more = len(newer) - _MOST_SHOWN
+        what = f"{more} more {'claims' if more > 1 else 'claim'} would change; " if more > 0 else ""
+        message = (
+            f"{what}claims that were booked or changed since are undone only with --drop-newer"
+        )
+        raise Refused([*refusals, fault("", message, code="newer")])
+    start = ledger
+    for change in changes:
+        restored = change.after
+        if restored and restored.lease:  # from now on, because its old end may have passed
+            restored = replace(restored, lease=restored.lease.started(now))
+        ledger = ledger.replace(change.key, restored)
+    keys = [change.key for change in changes]
+    return ledger, Changes(claims=claim_changes(start, ledger, keys))
+
+
+def _restored(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
+    earlier = {claim.key: claim for claim in request.claims}
+    changes = [ClaimChange(claim, None) for claim in ledger if claim.key not in earlier]
+    for key, claim in earlier.items():
+        current = ledger.get(key)
+        if current is not None:
+            # a renewal is no change, and neither is a claim that an override kept at another time
+            is_kept = current.keeping_override is not None
+            booked = claim.booked if is_kept else current.booked
+            same_lease = bool(current.lease) == bool(claim.lease)
+            if same_lease and replace(current, booked=booked, lease=claim.lease) == claim:
+                continue
+        changes.append(ClaimChange(current, claim))
+    return sorted(changes, key=lambda change: path_of(change.key))
+
+
+def restoration_faults(request: Restoration, world: World) -> Iterator[Fault]:
+    for change in _restored(world.ledger, request):
+        after = change.after
+        if after is None or after.keeping_override is not None:
+            continue
+        booking, config = request_for(after), world.config
+        for each in (*admission.faults(booking, config), *permission.faults(booking, config)):
+            yield each.within(path_of(change.key))
+
+
+def request_for(claim: Claim) -> Demand:
+    """Return a request that books this claim; its faults name fields of the claim."""
+    return Demand(
+        "put",
+        id=claim.request,
+        demanded=(Item(claim.held, claim.requesters),),
+        demand=claim.demand,
+        lease_s=claim.lease.seconds if claim.lease else None,
+    )
+
+
+# ---- the way in ----
 
 
 def apply(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:

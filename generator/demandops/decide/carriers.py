@@ -31,7 +31,7 @@ def with_implied_routes(request: AnyDemand, ledger: Ledger, config: Config) -> A
     if not request.adds_claims:
         return request
     brought = {
-        (key.receiver, key.target)
+        key[2:]
         for item in request.demanded
         if isinstance(item.held, Connection)
         for key in map(item.held.key_of, item.held.topics)
@@ -51,13 +51,13 @@ def with_implied_routes(request: AnyDemand, ledger: Ledger, config: Config) -> A
         for flow in flows(config, app):
             # Admission reports an unknown node and a topic that is not valid
             is_valid = (
-                {flow.sender, flow.receiver} <= config.domain_of.keys()
-                and not topic_problem(flow.topic)
-                and not topic_problem(flow.target)
+                {flow.key.sender, flow.key.receiver} <= config.domain_of.keys()
+                and not topic_problem(flow.key.topic)
+                and not topic_problem(flow.key.target)
             )
-            if not is_valid or (flow.receiver, flow.target) in brought:
+            if not is_valid or flow.key[2:] in brought:
                 continue
-            topic = flow.topic
+            topic = flow.key.topic
             if former := standing.serving(flow, request, demand):
                 claim, served = former
                 # an earlier goal of a demand that adds to what it holds may have listed the route
@@ -71,7 +71,7 @@ def with_implied_routes(request: AnyDemand, ledger: Ledger, config: Config) -> A
             if flow.delivery is not None:
                 place = f"deliver[{flow.delivery}]"
             connect = Connect() if app.connect.type == "none" else app.connect
-            connection = _implied(flow, connect, Route(topic, flow.target))
+            connection = _implied(flow, connect, Route(topic, flow.key.target))
             place = item.places[0] if item.places else f"{item.field}.{place}"
             more = Item(connection, item.requesters, item.field, (place,), is_listed=False)
             demanded.append(more)
@@ -83,7 +83,7 @@ def _implied(flow: Flow, connect: Connect, route: Route) -> Connection:
     type = route.type or (flow.type if kind and kind.needs_types else "")
     route = replace(route, type=type, implied=True)
     broker = "" if id_problem(connect.broker) else connect.broker  # admission refuses it
-    return Connection("", kind, flow.sender, flow.receiver, broker, (route,))
+    return Connection("", kind, flow.key.sender, flow.key.receiver, broker, (route,))
 
 
 _ORDER = attrgetter("subject.id", "demand")  # of the keys of claims
@@ -92,7 +92,7 @@ _ORDER = attrgetter("subject.id", "demand")  # of the keys of claims
 @dataclass(slots=True)
 class _StandingRoutes:
     ledger: Ledger
-    _by_target: dict[ClaimKey, dict[tuple[str, str], list[Route]]] = field(default_factory=dict)
+    _by_target: dict[ClaimKey, dict[tuple[str, ...], list[Route]]] = field(default_factory=dict)
 
     def serving(self, flow: Flow, request: Demand, demand: str) -> tuple[Claim, Route] | None:
         """Return the claim and route that bring an input already, perhaps by another source name.
@@ -100,24 +100,23 @@ class _StandingRoutes:
         A connection may give a topic of its source the name that applications know. A route with
         the flow's own name goes before such a route, and one of the demand before one of others.
         """
-        is_join = request.operation == "join"
-        same = RouteKey(flow.sender, flow.topic, flow.receiver, flow.target)
-        bringing = self.ledger.keys_with("brings", flow.receiver, flow.target)
+        is_join, same = request.operation == "join", flow.key
+        bringing = self.ledger.keys_with("brings", same.receiver, same.target)
         exact = sorted(self.ledger.keys_with("route", *same), key=_ORDER)[:1]
         # thousands of claims may bring a topic, mostly by this very route
         others = bringing if not exact else ()
         for holders in ([each for each in bringing if each.demand == demand], exact, others):
             found = []
-            for claim, route in self._bringing(holders, flow):
+            for claim, route in self._bringing(holders, same):
                 key, is_own = claim.connection.key_of(route), claim.demand == demand
                 was_listed = is_own and not route.implied
                 # from another node, only an earlier goal of the demand itself brings it
-                if key.sender != flow.sender and not (is_join and was_listed):
+                if key.sender != same.sender and not (is_join and was_listed):
                     continue
-                if key.topic != flow.topic and ("." in flow.name or flow.delivery is not None):
+                if key.topic != same.topic and ("." in flow.name or flow.delivery is not None):
                     continue
                 # a put gives up what it listed and lists no longer
-                if key.topic != flow.topic and was_listed and not is_join:
+                if key.topic != same.topic and was_listed and not is_join:
                     continue
                 found.append((key != same, claim.subject.id, claim, route))
             if found:
@@ -125,15 +124,16 @@ class _StandingRoutes:
                 return claim, route
         return None
 
-    def _bringing(self, holders: Iterable[ClaimKey], flow: Flow) -> Iterator[tuple[Claim, Route]]:
+    def _bringing(
+        self, holders: Iterable[ClaimKey], same: RouteKey
+    ) -> Iterator[tuple[Claim, Route]]:
         for claim in filter(None, map(self.ledger.get, sorted(holders, key=_ORDER))):
             if claim.key not in self._by_target:
-                routes: dict[tuple[str, str], list[Route]] = {}
+                routes: dict[tuple[str, ...], list[Route]] = {}
                 for route in claim.connection.topics:
-                    key = claim.connection.key_of(route)
-                    routes.setdefault((key.receiver, key.target), []).append(route)
+                    routes.setdefault(claim.connection.key_of(route)[2:], []).append(route)
                 self._by_target[claim.key] = routes
-            for route in self._by_target[claim.key].get((flow.receiver, flow.target), ()):
+            for route in self._by_target[claim.key].get(same[2:], ()):
                 yield claim, route
 
 
@@ -372,13 +372,13 @@ def with_moved_routes(world: World, claim: Claim, moved: Application) -> Ledger:
     if app.connect.type == "none":
         return ledger
     old, new = flows(config, app), flows(config, moved)
-    stays = {_path(flow) for flow in old} & {_path(flow) for flow in new}
+    stays = {flow.key for flow in old} & {flow.key for flow in new}
     former: dict[tuple[str, str], tuple[Connection, Route]] = {}
     for flow in old:
-        if _path(flow) in stays:
+        if flow.key in stays:
             continue
         for held, route in carrying(ledger, claim.demand, flow):
-            former[flow.topic, flow.target] = (held.connection, route)
+            former[flow.key.topic, flow.key.target] = (held.connection, route)
             # What a goal of the reference's action listed ends with the shutdown that lists it.
             if not held.joined and not route.implied:
                 topics = tuple(
@@ -389,13 +389,15 @@ def with_moved_routes(world: World, claim: Claim, moved: Application) -> Ledger:
                 ledger = ledger.replace(held.key, marked)
     items = []
     for flow in new:
-        if _path(flow) in stays:
+        if flow.key in stays:
             continue
-        connect, route = app.connect, Route(flow.topic, flow.target)
-        if like := former.get((flow.topic, flow.target)):
+        connect, route = app.connect, Route(flow.key.topic, flow.key.target)
+        if like := former.get((flow.key.topic, flow.key.target)):
             # as it was carried before the move, perhaps under another name at its source
             source = like[1].read_topic
-            route = replace(like[1], source=source, target=flow.target, reverse=False, listed="")
+            route = replace(
+                like[1], source=source, target=flow.key.target, reverse=False, listed=""
+            )
             kind = like[0].type
             connect = Connect(kind.word if kind else "auto", like[0].broker)
         items.append(Item(_implied(flow, connect, route), claim.requesters, is_listed=False))
@@ -411,15 +413,12 @@ def with_moved_routes(world: World, claim: Claim, moved: Application) -> Ledger:
     return ledger
 
 
-def _path(flow: Flow) -> tuple[str, str, str, str]:
-    return flow.topic, flow.sender, flow.receiver, flow.target
-
-
 def carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
-    for claim in ledger.claims_with("brings", flow.receiver, flow.target):
+    sender, _, *brought = flow.key
+    for claim in ledger.claims_with("brings", *brought):
         for route in claim.connection.topics if claim.demand == demand else ():
             key = claim.connection.key_of(route)
-            if (key.sender, *key[2:]) == (flow.sender, flow.receiver, flow.target):
+            if [key.sender, *key[2:]] == [sender, *brought]:
                 yield claim, route
 
 
@@ -440,7 +439,7 @@ def without_idle_routes(
     ):
         claims = ledger.claims_of_demand(demand)
         needed = {
-            (flow.sender, flow.receiver, flow.target)
+            (flow.key.sender, *flow.key[2:])
             for claim in claims
             if claim.is_on_application
             for flow in flows(config, claim.application)
@@ -452,7 +451,7 @@ def without_idle_routes(
             idle = {
                 (route.source,)
                 for route, key in keyed
-                if route.implied and (key.sender, key.receiver, key.target) not in needed
+                if route.implied and (key.sender, *key[2:]) not in needed
             }
             if idle:
                 ledger = ledger.replace(claim.key, claim.without_topics(idle))

@@ -16,7 +16,7 @@ from typing import Literal, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.connections.connection import ClientKey
-from demandops.decide import carriers, changeset, rollback, warnings
+from demandops.decide import carriers, changeset, warnings
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.completing import (
     completed,
@@ -24,7 +24,7 @@ from demandops.decide.admission.completing import (
     with_definitions,
     with_separate_instances,
 )
-from demandops.decide.booking import Drain, apply
+from demandops.decide.booking import Drain, Restoration, apply, restoration_faults
 from demandops.decide.changeset import Changeset, FileReader, PlannedChange, ReleaseChange
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.forbidden import Difference
@@ -34,10 +34,9 @@ from demandops.decide.placement.capacity import Need
 from demandops.decide.planning.flows import flows_without_carrier, without_idle_holds
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.release_keys import affected_keys
-from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
 from demandops.model.config.config import Config
-from demandops.model.demand.demand import Application, Demand
+from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import goal_field, read_goal
 from demandops.model.ledger.claim import demand_id
 from demandops.model.ledger.ledger import Changes, World, claim_changes, ledger_of
@@ -97,8 +96,8 @@ class Decision:
             # which domain it will get is open, so any in which it may wait counts
             put, config = waiting.put, self.state.config
             domains = (domain for domain in config.domains.values() if domain.when_full == "wait")
-            terms = (permission.term(put, domain) for domain in domains)
-            return min((term.seconds for term in terms if term), default=None)
+            leases = (permission.lease_in(domain, put) for domain in domains)
+            return min((lease.seconds for lease in leases if lease), default=None)
         claims = (
             self.state.ledger.claims_of_demand(self.request.demand) if self.request.demand else ()
         )
@@ -314,7 +313,7 @@ def _booked(
         united, _ = carriers.with_one_carrier(ledger_of(request.claims))
         request = replace(request, claims=tuple(united))
         request = relocation.with_restored_moves(request, state)
-        if faults := list(rollback.faults(request, state)):
+        if faults := list(restoration_faults(request, state)):
             raise Refused(faults)
     checkpoint()
     if strangers := list(permission.owner_faults(request, state.ledger, state.config)):
@@ -429,19 +428,18 @@ def _once(*texts: str) -> tuple[str, ...]:
 def notes_on(
     request: Demand, before: World, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
-    for item in request.demanded:
-        if isinstance(item.held, Application) and item.held.separate:
-            id, _, version = item.held.id.rpartition("@")
-            yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"
+    for app in request.applications:
+        if app.separate:
+            id, _, version = app.id.rpartition("@")
+            yield f"application '{id}' in version {version} runs separately, as '{app.id}'"
     # a connection that an override denies carries nothing
     ledger = without_suspended(after).ledger
-    for item in request.demanded if request.adds_claims else ():
-        if isinstance(item.held, Application):
-            for flow in flows_without_carrier(after.config, item.held, ledger):
-                yield (
-                    f"application '{item.held.id}': no connection carries {flow.topic} "
-                    f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
-                )
+    for app in request.applications if request.adds_claims else ():
+        for flow in flows_without_carrier(after.config, app, ledger):
+            yield (
+                f"application '{app.id}': no connection carries {flow.key.topic} ({flow.name}) of "
+                f"'{flow.key.sender}' to '{flow.key.receiver}'"
+            )
     yield from request.notes
     for change in changes.claims:
         if change.after and not change.after.is_on_application:

@@ -10,8 +10,9 @@ from itertools import chain
 
 from demandops.base.errors import Fault, Refused
 from demandops.base.naming import Subject
-from demandops.decide import changeset, rollback
+from demandops.decide import changeset
 from demandops.decide.admission import admission, permission
+from demandops.decide.booking import request_for
 from demandops.decide.changeset import Changeset, FileReader
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.placement import capacity
@@ -24,7 +25,14 @@ from demandops.model.config.override import Override, format_time
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import ClaimKey
-from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, changes_on
+from demandops.model.ledger.ledger import (
+    Changes,
+    ClaimChange,
+    Ledger,
+    World,
+    changes_on,
+    claim_changes,
+)
 
 # ---- claims that a person edits: what changes with them, and what is wrong with them ----
 
@@ -52,7 +60,7 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
             and {*claim.requesters} <= {*old.requesters}
         ):
             continue
-        wanted, config = rollback.request_for(claim), after.config
+        wanted, config = request_for(claim), after.config
         malformed = list(admission.faults(wanted, config))
         allowed = chain(
             permission.faults(wanted, config),
@@ -113,19 +121,22 @@ def update_ledger(
         files[path] = records.ended_override_text(override)
     after = replace(after, ledger=replace(after.ledger, ended=ended))
     kept = [c.subject for ledger in (before.ledger, after.ledger) for c in ledger.kept_claims()]
-    update = update_claims(before.ledger, after, dict.fromkeys((*subjects, *kept)), now)
-    moved = following_overrides(replace(after, ledger=update.ledger))
-    keys = (*update.keys, *moved.keys)
-    files |= changed_claim_files(after.ledger, moved.ledger, keys)
-    return replace(moved, keys=keys, files=files)
+    subjects = dict.fromkeys((*subjects, *kept))
+    update = update_claims(before.ledger, after, subjects, now, moves_all=True)
+    return replace(update, files={**files, **update.files})
 
 
 def update_claims(
-    before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
+    before: Ledger,
+    after: World,
+    subjects: Iterable[Subject],
+    now: datetime,
+    *,
+    moves_all: bool = False,  # and not only those of ``subjects``
 ) -> LedgerUpdate:
     subjects = tuple(subjects)
     ledger, kept = overrides.update_kept_claims(before, after, subjects, now)
-    moved = following_overrides(replace(after, ledger=ledger), subjects)
+    moved = following_overrides(replace(after, ledger=ledger), None if moves_all else subjects)
     keys = (*kept, *moved.keys)
     files = changed_claim_files(after.ledger, moved.ledger, keys)
     return replace(moved, keys=keys, files=files)
@@ -145,12 +156,10 @@ def changed_claim_files(
     before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
 ) -> dict[str, str | None]:
     """Return the new texts of the files of changed claims, by path; ``None`` removes a file."""
-    files: dict[str, str | None] = {}
-    for key in keys:
-        claim = after.get(key)
-        if claim != before.get(key):
-            files[claim_files.path_of(key)] = claim_files.text_of(claim) if claim else None
-    return files
+    return {
+        claim_files.path_of(change.key): claim_files.text_of(change.after) if change.after else None
+        for change in claim_changes(before, after, keys)
+    }
 
 
 def expired_overrides(world: World, now: datetime) -> list[Override]:

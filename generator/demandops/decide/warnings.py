@@ -72,10 +72,10 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
             maker = f"application '{topic.application}' of '{topic.source}'"
             yield f"{role} {topic.topic} does not arrive: {maker} does not make it"
     for flow in flows_without_carrier(config, app, active.ledger):
-        if flow.sender in config.nodes:
+        if flow.key.sender in config.nodes:
             yield (
-                f"{flow.name} {flow.topic} does not arrive: no connection carries it from "
-                f"'{flow.sender}' to '{flow.receiver}'"
+                f"{flow.name} {flow.key.topic} does not arrive: no connection carries it from "
+                f"'{flow.key.sender}' to '{flow.key.receiver}'"
             )
     services = config.services.get(app.appdef, {})
     for delivery in app.deliver:

@@ -29,18 +29,6 @@ class Autoscaler:
         by = ", ".join(f"{name} {percent} %" for name, percent in self.targets.items())
         return f"{self.min} to {self.max} by an autoscaler ({by})"
 
-    def values(self) -> dict[str, int]:
-        targets = {str(name): percent for name, percent in self.targets.items()}
-        return {"min": self.min, "max": self.max} | targets
-
-
-def overridden(replicas: int | Autoscaler, number: int) -> int | Autoscaler:
-    # Where an autoscaler owns the number, the manifest tells the GitOps controller to ignore
-    # ``spec.replicas``. So the number is set as both bounds of the autoscaler.
-    if isinstance(replicas, Autoscaler):
-        return Autoscaler(number, number, replicas.targets)
-    return number
-
 
 def most_replicas(replicas: int | Autoscaler) -> int:
     return replicas.max if isinstance(replicas, Autoscaler) else replicas

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import dropwhile, takewhile
 from typing import Any
 
@@ -17,7 +17,7 @@ from demandops.base.settings import MAIN_BRANCH
 from demandops.connections.connection import UNSUPPORTED, Client
 from demandops.model.config.config import IMAGES_FILE, Config
 from demandops.model.config.inventory import NODE_LABEL
-from demandops.model.config.override import Override, format_time
+from demandops.model.config.override import format_time
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ChartSource
 from demandops.model.config.repo_settings import RepoSettings
@@ -80,9 +80,13 @@ _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 def release_text(release: Release, config: Config, evaluate: Evaluate, current: str | None) -> str:
     outside, of_body = list[str](), list[str]()
-    for override, effects in release.shaping.by:
+    for each, effects in release.shaping.by:
+        until = f"until {format_time(each.end)}; " if each.end else ""
         is_outside = release.shaping.held and _OUTSIDE_BODY & {*effects}
-        (outside if is_outside else of_body).append(override_comment(override, effects))
+        (outside if is_outside else of_body).append(
+            f"# override {each.path}: {', '.join(effects)}; priority {each.priority}; {until}"
+            f"owner {each.owner}; reason: {each.reason}"
+        )
     if current is None or not release.shaping.held:
         comments, body = [*outside, *of_body], render(release, config, evaluate)
     else:
@@ -94,14 +98,6 @@ def release_text(release: Release, config: Config, evaluate: Evaluate, current: 
     return "".join(f"{comment}\n" for comment in comments) + body
 
 
-def override_comment(override: Override, effects: tuple[str, ...]) -> str:
-    until = f"until {format_time(override.end)}; " if override.end else ""
-    return (
-        f"# override {override.path}: {', '.join(effects)}; priority {override.priority}; {until}"
-        f"owner {override.owner}; reason: {override.reason}"
-    )
-
-
 def render(release: Release, config: Config, evaluate: Evaluate) -> str:
     """Return the manifests of a release as text; raise Refused or InvalidInput if not possible.
 
@@ -109,28 +105,19 @@ def render(release: Release, config: Config, evaluate: Evaluate) -> str:
     """
     if not isinstance(release, ServiceRelease):
         return render_connection(release, config)
-    values, chart, repository = (
-        values_of(release, config, evaluate),
-        release.chart,
-        config.repo_settings,
-    )
-    if repository.gitops == "argocd":
-        return engine.text(
-            "argocd/release.yaml.j2",
-            release=release,
-            chart=chart,
-            values=values,
-            project=project_of(release.domain, repository),
-            repository=repository,
-            branch=MAIN_BRANCH,
-            server=IN_CLUSTER,
-        )
+    values, chart = values_of(release, config, evaluate), release.chart
+    repository = config.repo_settings
     return engine.text(
-        "flux/release.yaml.j2",
+        f"{repository.gitops}/release.yaml.j2",
         release=release,
+        chart=chart,
         chart_kind="OCIRepository" if chart.oci else "HelmChart",
         chart_name=chart_object(release.service.chart, chart),
         values=values,
+        project=project_of(release.domain, repository),
+        repository=repository,
+        branch=MAIN_BRANCH,
+        server=IN_CLUSTER,
     )
 
 
@@ -205,8 +192,9 @@ def _variables(release: ServiceRelease, config: Config) -> dict[str, object]:
     }
     # Never both. A template that knows only ``replicas`` must fail, because the GitOps controller
     # would set back what the autoscaler writes.
-    if release.autoscaler:
-        variables["autoscaler"] = release.autoscaler.values()
+    if scaler := release.autoscaler:
+        targets = {str(name): percent for name, percent in scaler.targets.items()}
+        variables["autoscaler"] = {"min": scaler.min, "max": scaler.max, **targets}
     else:
         variables["replicas"] = release.replicas
     if release.key.application is not None:
@@ -223,12 +211,6 @@ def _variables(release: ServiceRelease, config: Config) -> dict[str, object]:
 
 
 def render_connection(client: Client, config: Config) -> str:
-    """Return the manifests of a client as one YAML text.
-
-    Raises:
-        InvalidInput: if an override's patch gives no valid settings.
-        Refused: if the registry has no image for the client.
-    """
     kind, node = client.type, client.node
     if kind.image not in config.images:
         message = (
@@ -258,17 +240,6 @@ def render_connection(client: Client, config: Config) -> str:
         host_network=node.host_network if settings.host_network is None else settings.host_network,
         image=client.shaping.image(kind.image, config.images[kind.image]).reference(),
     )
-
-
-# ---- the other files: of domains and clusters, and chart sources ----
-
-
-def base_files(config: Config) -> dict[str, str]:
-    # Each access domain of a cluster has a placeholder file, because Git keeps no empty folder.
-    # Without the folder, Flux and Argo CD would fail instead of removing what is not demanded.
-    if config.repo_settings.gitops == "argocd":
-        return argocd_base_files(config)
-    return flux_base_files(config)
 
 
 def kept_charts(
@@ -344,27 +315,6 @@ ANNOTATION = "demandops/bootstrap"
 _LENGTH = 16
 
 
-def _bootstrap(
-    template: str, cluster: str, domains: list[AccessDomain], config: Config, **more: object
-) -> str:
-    """Return the text of a bootstrap file that contains its own digest."""
-
-    def render(digest: str) -> str:
-        return engine.text(
-            template,
-            digest=digest,
-            cluster=cluster,
-            domains=domains,
-            node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
-            folders={domain.name: domain_folder(cluster, domain) for domain in domains},
-            repository=config.repo_settings,
-            branch=MAIN_BRANCH,
-            **more,
-        )
-
-    return render(_digest(render("")))  # the digest covers neither itself nor comments
-
-
 @lru_cache(maxsize=256)  # most changes of a configuration leave the bootstrap files as they are
 def _digest(text: str) -> str:
     objects = json.dumps(list(strict_yaml.load_all(text)), sort_keys=True)
@@ -397,33 +347,6 @@ def chart_object(name: str, chart: ChartSource) -> str:
     return f"{name}-{chart.version}".lower()
 
 
-def flux_base_files(config: Config) -> dict[str, str]:
-    # without the URL of the repo, there is nothing that a bootstrap file could make Flux follow
-    flux = config.repo_settings.flux
-    files = {
-        bootstrap_path(cluster): _bootstrap("flux/bootstrap.yaml.j2", cluster, domains, config)
-        for cluster, domains in domains_by_cluster(config).items()
-        if flux is not None and flux.url is not None
-    }
-    for cluster, domain in domains_in_use(config):
-        folder = domain_folder(cluster, domain)
-        files[f"{folder}/_domain.yaml"] = engine.text(
-            "flux/domain.yaml.j2", cluster=cluster, domain=domain
-        )
-        for name, chart in sorted(config.charts.items()):
-            for source in chart.sources():
-                object_name = chart_object(name, source)
-                files[f"{folder}/_charts/{object_name}.yaml"] = engine.text(
-                    "flux/chart.yaml.j2",
-                    chart=source,
-                    chart_name=name,
-                    name=object_name,
-                    namespace=domain.namespace,
-                    source=config.repo_settings.source,
-                )
-    return files
-
-
 # ---- manifests for Argo CD: an Application for each service and for each domain's folder ----
 #
 # The fields are those of argoproj.io/v1alpha1 in Argo CD 3.2. Each cluster has its own Argo CD. The
@@ -439,28 +362,52 @@ def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
     return f"{repository.source}-{domain.name}"
 
 
-def argocd_base_files(config: Config) -> dict[str, str]:
-    section = config.repo_settings.argocd
-    assert section is not None  # noqa: S101 - required when gitops is "argocd"
+# ---- the other files: of domains and clusters, and chart sources ----
+
+
+def base_files(config: Config) -> dict[str, str]:
+    repository, gitops = config.repo_settings, config.repo_settings.gitops
+    source = repository.argocd if gitops == "argocd" else repository.flux
     # Applications may fetch only from these: the state repo and the charts' repositories
-    charts = {
-        source.oci or source.http for chart in config.charts.values() for source in chart.sources()
-    }
-    urls = [section.url, *sorted(url for url in charts if url and url != section.url)]
-    files = {
-        bootstrap_path(cluster): _bootstrap(
-            "argocd/bootstrap.yaml.j2",
-            cluster,
-            domains,
-            config,
-            projects={domain.name: project_of(domain, config.repo_settings) for domain in domains},
-            urls=urls,
+    charts = (chart for listed in config.charts.values() for chart in listed.sources())
+    fetched = {chart.oci or chart.http for chart in charts} - {None, source and source.url}
+    projects = {domain.name: project_of(domain, repository) for domain in config.domains.values()}
+    files: dict[str, str] = {}
+    for cluster, domains in domains_by_cluster(config).items():
+        # without the URL of the repo, there is nothing that a bootstrap file could make Flux follow
+        if source is None or source.url is None:
+            continue
+        bootstrap = partial(
+            engine.text,
+            f"{gitops}/bootstrap.yaml.j2",
+            cluster=cluster,
+            domains=domains,
+            node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
+            folders={domain.name: domain_folder(cluster, domain) for domain in domains},
+            repository=repository,
+            branch=MAIN_BRANCH,
+            projects=projects,
+            urls=[source.url, *sorted(filter(None, fetched))],
             server=IN_CLUSTER,
         )
-        for cluster, domains in domains_by_cluster(config).items()
-    }
+        # the file contains its own digest, which covers neither itself nor comments
+        files[bootstrap_path(cluster)] = bootstrap(digest=_digest(bootstrap(digest="")))
     for cluster, domain in domains_in_use(config):
-        files[f"{domain_folder(cluster, domain)}/_domain.yaml"] = engine.text(
-            "argocd/domain.yaml.j2", cluster=cluster, domain=domain
+        # Each access domain of a cluster has a placeholder file, because Git keeps no empty folder.
+        # Without the folder, Flux and Argo CD would fail instead of removing what is not demanded.
+        folder = domain_folder(cluster, domain)
+        files[f"{folder}/_domain.yaml"] = engine.text(
+            f"{gitops}/domain.yaml.j2", cluster=cluster, domain=domain
         )
+        for name, chart in sorted(config.charts.items()) if gitops == "flux" else ():
+            for version in chart.sources():
+                object_name = chart_object(name, version)
+                files[f"{folder}/_charts/{object_name}.yaml"] = engine.text(
+                    "flux/chart.yaml.j2",
+                    chart=version,
+                    chart_name=name,
+                    name=object_name,
+                    namespace=domain.namespace,
+                    source=repository.source,
+                )
     return files

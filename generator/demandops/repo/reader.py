@@ -14,8 +14,8 @@ from demandops.base import settings
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import with_lines
+from demandops.decide.booking import Restoration
 from demandops.decide.changeset import FileReader
-from demandops.decide.rollback import Restoration
 from demandops.decide.state import rendered_files
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Rollback

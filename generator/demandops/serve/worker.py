@@ -21,8 +21,8 @@ from demandops.base.errors import (
 )
 from demandops.base.runtime import Runtime
 from demandops.base.settings import MAIN_BRANCH, RENDER_VERSION
+from demandops.decide.booking import Restoration
 from demandops.decide.decision import Decision, Outcome, decide
-from demandops.decide.rollback import Restoration
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand, Rollback
 from demandops.repo.git import signing

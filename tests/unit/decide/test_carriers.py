@@ -8,9 +8,9 @@ from typing import Any
 
 from demandops.base.errors import Refused
 from demandops.connections.connection import Connection, RouteKey
+from demandops.decide.booking import Restoration
 from demandops.decide.carriers import with_one_carrier
 from demandops.decide.edits import faults_of_edit
-from demandops.decide.rollback import Restoration
 from demandops.model.ledger.claim import Claim, path_of
 from demandops.model.ledger.ledger import ClaimChange, ledger_of
 from hypothesis import given

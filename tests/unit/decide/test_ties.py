@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from demandops.decide.changeset import trial_releases
 from demandops.decide.planning.overrides import Traits, apply_effects, effects_on, fits
+from demandops.model.config.cross_check import patterns_overlap
 from demandops.model.config.override import Override, OverrideFile, Selector
-from demandops.model.config.override_conflicts import patterns_overlap
 from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease
 from demandops.templating.charts import merged, overridden

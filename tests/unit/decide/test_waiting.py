@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decide.rollback import Restoration
+from demandops.decide.booking import Restoration
 from demandops.model.demand.demand import Decommission
 from demandops.model.ledger import records
 from demandops.model.ledger.records import in_turn

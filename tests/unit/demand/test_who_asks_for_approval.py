@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
-from demandops.decide.admission.permission import with_leases_from_approval
 from demandops.model.config.load import load
 from demandops.model.demand.demand import UNSTARTED
 from demandops.model.ledger import claim as claim_files
@@ -89,7 +89,7 @@ def test_only_a_demand_that_adds_something_needs_approval() -> None:
 def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     books = repo_with(approval="required")
     decision = books.decide(asked("edge/first", lease=60))
-    ledger = books.decide(with_leases_from_approval(decision.request)).state.ledger
+    ledger = books.decide(replace(decision.request, awaits_approval=True)).state.ledger
     claims = ledger.claims_of_demand("d")
     claim = next(one for one in claims if one.is_on_application)
     assert claim.lease is not None

@@ -16,7 +16,7 @@ from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
 from demandops.connections.zenoh import ZENOH
 from demandops.decide.booking import apply
-from demandops.model.demand.demand import Demand, Item, Term
+from demandops.model.demand.demand import Demand, Item, Lease
 from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim
 from demandops.model.ledger.ledger import Changes, Ledger
 
@@ -26,7 +26,7 @@ HELD = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
 
 
 def item(*requesters: str, held: Connection = HELD) -> tuple[Item, ...]:
-    return (Item(held, requesters, term=Term(60)),)
+    return (Item(held, requesters, lease=Lease(60)),)
 
 
 def applied(ledger: Ledger, request: Demand, minutes: int = 0) -> tuple[Ledger, Changes]:

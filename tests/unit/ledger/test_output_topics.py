@@ -9,9 +9,9 @@ from dataclasses import replace
 from typing import Any
 
 import yaml
+from demandops.decide.booking import Restoration
 from demandops.decide.edits import faults_of_edit
 from demandops.decide.planning.flows import with_booked_topics_marked
-from demandops.decide.rollback import Restoration
 from demandops.model.ledger.claim import Claim, path_of
 from demandops.model.ledger.ledger import ClaimChange
 

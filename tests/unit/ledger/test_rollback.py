@@ -9,8 +9,8 @@ from random import Random
 
 import pytest
 from demandops.base.errors import Fault, Refused
+from demandops.decide.booking import Restoration
 from demandops.decide.decision import Decision, decide
-from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
 from demandops.model.demand.demand import Lease
 from demandops.model.ledger.claim import Claim

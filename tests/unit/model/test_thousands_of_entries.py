@@ -17,9 +17,9 @@ import pytest
 import yaml
 from demandops.base.errors import Fault, InvalidInput
 from demandops.model.config.config import ConfigReader
+from demandops.model.config.cross_check import check_override_conflicts
 from demandops.model.config.load import load
 from demandops.model.config.override import by_rank
-from demandops.model.config.override_conflicts import check_override_conflicts
 from hypothesis import given
 from hypothesis import strategies as st
 

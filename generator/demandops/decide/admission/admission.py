@@ -18,7 +18,14 @@ from demandops.connections import connection as routes
 from demandops.connections import connection_types
 from demandops.connections.connection import Connection
 from demandops.model.config.appdef import ApplicationDefinition, Services
-from demandops.model.config.config import BROKERS_FILE, DOMAINS_FILE, NODES_FILE, Config
+from demandops.model.config.config import (
+    BROKERS_FILE,
+    CHARTS_FILE,
+    DOMAINS_FILE,
+    NODES_FILE,
+    VERSIONS_FILE,
+    Config,
+)
 from demandops.model.config.repo_settings import Limits
 from demandops.model.demand.demand import (
     LONGEST_S,
@@ -73,8 +80,7 @@ def faults(request: Demand, config: Config) -> Iterator[Fault]:
 
 
 def items_of(request: Demand) -> int:
-    items = len(request.own_requesters)
-    items += len(request.positions)
+    items = len(request.own_requesters) + len(request.positions)
     for item in request.demanded:
         held = item.held
         if isinstance(held, Application):
@@ -179,12 +185,13 @@ def _definition_faults(
     for role in unknown:
         message = f"{appdef.name} has no such input" + suggestion(role, appdef.inputs)
         yield fault(f"inputs.{role}", message)
-    parameters = config.parameters_of(appdef.name) if app.parameters else set()
+    services = config.services[appdef.name]
+    parameters = {*appdef.parameters} if app.parameters else set()
+    parameters = parameters.union(*(service.parameters for service in services.values()))
     for name in app.parameters:
         if name not in parameters:
             close = suggestion(name, parameters)
             yield fault(f"parameters.{name}", f"{appdef.name} has no such parameter{close}")
-    services = config.services[appdef.name]
     for service in services.values():
         if service.nodes and app.node in config.nodes and app.node not in service.runs_at:
             cluster = config.nodes[app.node].cluster
@@ -221,11 +228,10 @@ def _definition_faults(
             f"version '{version}' instead, or choose an id that does not end in '@{version}'",
         )
     if app.version and app.version not in versions:
-        yield fault(
-            "version",
-            f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
-            f"{config.versions_file(appdef.name)}{suggestion(app.version, versions)}",
-        )
+        listed = config.entry_files.get(VERSIONS_FILE, {}).get(appdef.name)
+        where = f"{appdef.name} in {listed or config.place_of(CHARTS_FILE)}"
+        message = f"{quoted(app.version)} is not a version or channel of {where}"
+        yield fault("version", message + suggestion(app.version, versions))
 
 
 def _unknown_application(name: str, config: Config) -> Fault:

@@ -63,25 +63,24 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
     # before what depends on the connection: its lease, type, permission, quota and approval
     demand = carriers.with_carriers(demand, ledger, config)
     checkpoint()
-    demand = permission.with_lease_terms(demand, config)
+    homes = [(item, config.domain_of.get(item.held.home)) for item in demand.demanded]
+    leased = (
+        replace(item, lease=permission.lease_in(home, demand) if home else None)
+        for item, home in homes
+    )
+    demand = replace(demand, demanded=tuple(leased))
     demand = admission.with_chosen_types(demand, config, ledger.connection)
-    if demand.operation == "join":
-        demand = _without_impossible_routes(demand, config)
-    return replace(demand, is_complete=True)
-
-
-def _without_impossible_routes(demand: AnyDemand, config: Config) -> AnyDemand:
-    # A client of the reference does not ask for the connections that it does not list, and gets a
-    # warning where there can be none.
     possible = []
     for item in demand.demanded:
+        # A client of the reference does not ask for the connections that it does not list, and gets
+        # a warning where there can be none.
         topics = item.held.topics if isinstance(item.held, Connection) else ()
-        if topics and all(route.implied for route in topics):
+        if demand.operation == "join" and topics and all(route.implied for route in topics):
             alone = replace(demand, demanded=(item,))
             if [*admission.faults(alone, config), *permission.faults(alone, config)]:
                 continue
         possible.append(item)
-    return replace(demand, demanded=tuple(possible))
+    return replace(demand, demanded=tuple(possible), is_complete=True)
 
 
 # ---- the definition that a goal of the reference's action means by a number ----
@@ -96,15 +95,19 @@ def with_definitions(demand: AnyDemand, config: Config) -> AnyDemand:
         number = item.held.appdef.removeprefix("#") if isinstance(item.held, Application) else ""
         if not isinstance(item.held, Application) or number == item.held.appdef:
             continue
-        appdef = config.appdef_by_wire_type(int(number)) if number.isdecimal() else None
-        if appdef is None or (wire := appdef.deployment_request) is None:
+        meant = (
+            (name, wire)
+            for name, appdef in config.appdefs.items()
+            if (wire := appdef.deployment_request) and str(wire.type) == number
+        )
+        if (named := next(meant, None)) is None:
             continue
-        roles = {str(name): role for name, role in wire.inputs.items()}
+        roles = {str(name): role for name, role in named[1].inputs.items()}
         inputs: dict[str, tuple[InputTopic, ...]] = {}
         for name, topics in item.held.inputs.items():  # both lists may be of one role
             role = roles.get(name) or name
             inputs[role] = (*inputs.get(role, ()), *topics)
-        demanded[index] = replace(item, held=replace(item.held, appdef=appdef.name, inputs=inputs))
+        demanded[index] = replace(item, held=replace(item.held, appdef=named[0], inputs=inputs))
     return replace(demand, demanded=tuple(demanded))
 
 
@@ -129,8 +132,8 @@ def with_chosen_domains(
     demanded = []
     for item in request.demanded:
         held = _with_short_names(item.held, config)
-        booked = ledger.held(held.subject)
-        booked_nodes = _named(booked) if booked else {}
+        booked = ledger.first_claim(held.subject)
+        booked_nodes = _named(booked.held) if booked else {}
         chosen = _chosen(item, booked_nodes, config, request.adds_claims, faults)
         nodes = {**_named(held), **dict(chosen)}
         if isinstance(held, Application):
@@ -209,13 +212,7 @@ def _chosen(
 
 
 def with_separate_instances(request: AnyDemand, config: Config) -> AnyDemand:
-    demanded = (
-        replace(item, held=_separated(item.held, config))
-        if isinstance(item.held, Application) and item.held.version
-        else item
-        for item in request.demanded
-    )
-    return replace(request, demanded=tuple(demanded))
+    return request.with_each(lambda app: _separated(app, config) if app.version else app)
 
 
 def _separated(app: Application, config: Config) -> Application:

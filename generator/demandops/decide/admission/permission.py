@@ -16,7 +16,7 @@ from demandops.connections.connection import Connection
 from demandops.model.config.base_model import duration_text, seconds_of
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain, Rule, matches
-from demandops.model.demand.demand import AnyDemand, Application, Demand, Item, Term
+from demandops.model.demand.demand import Application, Demand, Item, Lease
 from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import Ledger
 
@@ -165,20 +165,14 @@ def stranger_faults(
         yield fault("demand", message, code="not-yours")
 
 
-def with_lease_terms(request: AnyDemand, config: Config) -> AnyDemand:
-    homes = [(item, config.domain_of.get(item.held.home)) for item in request.demanded]
-    demanded = [replace(item, term=term(request, home) if home else None) for item, home in homes]
-    return replace(request, demanded=tuple(demanded))
-
-
-def term(request: Demand, domain: AccessDomain) -> Term | None:
+def lease_in(domain: AccessDomain, request: Demand) -> Lease | None:
     policy = domain.leases
     # the reference's clients need not repeat their demands, unless the policy says so
     if request.is_reference and not policy.deployment_requests:
         return None
     given = policy.default or policy.longest
     seconds = request.lease_s or (seconds_of(given) if given else None)
-    return Term(seconds, seconds_of(policy.slack)) if seconds else None
+    return Lease(seconds, seconds_of(policy.slack)) if seconds else None
 
 
 def approval_reasons(
@@ -215,11 +209,3 @@ def approval_reasons(
                 if not requiring and domain.approval == "required":
                     reasons[f"access domain '{domain.name}'"] = None
     return tuple(reasons)
-
-
-def with_leases_from_approval(request: AnyDemand) -> AnyDemand:
-    demanded = (
-        replace(item, term=replace(item.term, on_approval=True)) if item.term else item
-        for item in request.demanded
-    )
-    return replace(request, demanded=tuple(demanded))

@@ -15,11 +15,11 @@ from demandops.base.errors import Fault, InvalidInput, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections.connection import ClientKey
 from demandops.decide import carriers
+from demandops.decide.booking import request_for
 from demandops.decide.planning import release_keys
 from demandops.decide.planning.flows import outputs, usual_topic
 from demandops.decide.planning.planner import service_name
 from demandops.decide.planning.release_keys import ReleaseKey, is_needed, keys_of, keys_of_claims
-from demandops.decide.rollback import request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.demand.demand import Application, Demand
@@ -45,7 +45,7 @@ def topic_faults(
     for key in keys:
         if isinstance(key, ServiceKey) and not is_needed(before, key):
             yield from islice(_clashes_of_service(request, after, key), 1)
-    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
+    apps = request.applications
     chosen = any(app.place or {*app.services} - {*app.named} for app in apps)
     for item in request.demanded:
         connection = item.held

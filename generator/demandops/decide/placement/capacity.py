@@ -49,10 +49,8 @@ def whole_usage(world: World) -> Usage:
     """Return what all services request on each node; empty if no node declares a capacity."""
     if not world.config.limits_capacity:
         return Usage()
-    keys: dict[ReleaseKey, None] = {}
-    for subject in world.ledger.claims:
-        if subject.kind is SubjectKind.APPLICATION:
-            keys |= dict.fromkeys(release_keys.keys_of(world, subject))
+    apps = (each for each in world.ledger.claims if each.kind is SubjectKind.APPLICATION)
+    keys = dict.fromkeys(key for app in apps for key in release_keys.keys_of(world, app))
     return Usage().plus(requests(_plan_leniently(world, keys), world.config))
 
 

@@ -66,14 +66,13 @@ def search(
 
     ``checkpoint`` is called at each step; it may raise an exception to end the search.
     """
-    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
     # A service with a node of its own, in the request or in the ledger, needs its node checked.
     is_open = any(
         app.place
         or app.services
         or _services_to_place(app, state)
         or ((booked := state.ledger.application(app.id)) and booked.services)
-        for app in apps
+        for app in request.applications
     )
     if not request.adds_claims or not is_open:
         return attempt(request, ())
@@ -83,8 +82,8 @@ def search(
         return attempt(placed, faults)
     except Refused as refusal:
         full = refusal.full.keys() if isinstance(refusal, NoRoom) else ()
-        apps = [item.held for item in placed.demanded if isinstance(item.held, Application)]
-        nodes = {state.config.host_of(node) for app in apps for node in app.chosen_nodes}
+        chosen = (node for app in placed.applications for node in app.chosen_nodes)
+        nodes = {*map(state.config.host_of, chosen)}
         elsewhere = nodes & {*full} or all(each.code in _BY_NODE for each in refusal.faults)
         if faults or not elsewhere:
             raise
@@ -134,8 +133,7 @@ class _Places(Generic[_Result]):
         kept = (each for subject in request.subjects() for each in ledger.kept_claims(subject))
         own = [*ledger.claims_of_demand(request.demand), *kept]
         nodes = {node for c in own if c.is_on_application for node in c.application.needed_nodes()}
-        apps = (item.held for item in request.demanded if isinstance(item.held, Application))
-        placed = Counter(app.node for app in apps if app.node)
+        placed = Counter(app.node for app in request.applications if app.node)
         return Room(self._state, self._state.usage(), nodes, placed=placed)
 
     def placed(self) -> tuple[Demand, list[Fault]]:
@@ -187,7 +185,7 @@ class _Places(Generic[_Result]):
     def _place_application(
         self, index: int, item: Item, app: Application, place: Requirement
     ) -> None:
-        choice = self._choice(item, place)
+        choice = Choice(item, place, self._room, None, self._request.positions)
         if app.node:
             # ``node`` and ``place`` together are a check of the named node, and no preference.
             node = choice.config.nodes.get(app.node)
@@ -253,7 +251,8 @@ class _Places(Generic[_Result]):
         return booked if booked and booked.appdef == app.appdef else None
 
     def _place_service(self, index: int, service: Service) -> None:
-        choice = self._choice(self._demanded[index], requirement_of(service), service)
+        item, positions = self._demanded[index], self._request.positions
+        choice = Choice(item, requirement_of(service), self._room, service, positions)
         first = self._booked_as(choice.app)
         here = first.services.get(service.name, "") if first else ""
         shared = _shared_node(choice.app, service, self._state)
@@ -263,11 +262,6 @@ class _Places(Generic[_Result]):
         elif shared and choice.has_room(shared):
             chosen = Chosen(shared, "where the service already runs for this topic")
         self._take(index, choice, chosen)
-
-    def _choice(
-        self, item: Item, requirement: Requirement, service: Service | None = None
-    ) -> Choice:
-        return Choice(item, requirement, self._room, service, self._request.positions)
 
     def _take(self, index: int, choice: Choice, chosen: Chosen | None) -> None:
         """Put the application or service on ``chosen``, or else on the first node that will do."""

@@ -13,7 +13,7 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
-from demandops.decide.booking import Drain, conflicts
+from demandops.decide.booking import Drain, Restoration, conflicts, request_for
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.collisions import Names
 from demandops.decide.placement import candidates, capacity
@@ -22,7 +22,6 @@ from demandops.decide.placement.capacity import Need, Usage
 from demandops.decide.planning import overrides
 from demandops.decide.planning.flows import flows, with_booked_outputs
 from demandops.decide.planning.release_keys import affected_keys
-from demandops.decide.rollback import Restoration, request_for
 from demandops.model.config.appdef import Service
 from demandops.model.demand.demand import Application, Demand, InputTopic, Item, Requirement
 from demandops.model.ledger.claim import Claim, ClaimKey, requesters_of
@@ -114,12 +113,13 @@ def with_moves(
                 continue
             choice = _choice_for(world, claims, service, usage)
             try:
-                chosen, move = choice.first(partial(_moved, world, names, usage, claims, service))
+                chosen, moving = choice.first(partial(_moved, world, names, usage, claims, service))
             except Refused as refusal:
                 stays.append(f"{what[0]} stays, because {refusal.faults[0].message}")
             else:
-                world, names, usage = move.world, move.names, usage.plus(move.grown)
-                keys += [change.key for change in move.changes]
+                world, names, changes, grown = moving
+                usage = usage.plus(grown)
+                keys += [change.key for change in changes]
                 on = f"is placed on {quoted(chosen.node)}, {chosen.why}"
                 moved += [f"{text} {on}" for text in what]
             attempts += len(choice.refused)
@@ -179,16 +179,6 @@ def _choice_for(
     return Choice(Item(app, requesters_of(claims)), required, Room(world, usage), service)
 
 
-@dataclass(frozen=True, slots=True)
-class _Move:
-    """A move of claims to another node: the world and the names after it, and what it changes."""
-
-    world: World
-    names: Names
-    changes: tuple[ClaimChange, ...]
-    grown: Mapping[Need, int]
-
-
 def _moved(
     world: World,
     names: Names,
@@ -196,14 +186,17 @@ def _moved(
     claims: tuple[Claim, ...],
     service: Service | None,
     chosen: Chosen,
-) -> _Move:
-    """Return the move of claims to a node; raise Refused if it would cause a fault."""
+) -> tuple[World, Names, tuple[ClaimChange, ...], Mapping[Need, int]]:
+    """Move claims to a node, or raise Refused if that would cause a fault.
+
+    Return the world and the names after it, and what changes of claims and of usage.
+    """
     for claim in claims:
         for flow in flows(world.config, claim.application):
             for _, route in carriers.carrying(world.ledger, claim.demand, flow):
                 # On the sender's own node, no connection would rename the topic.
                 renamed = flow.delivery is None and route.read_topic != route.written_topic
-                if renamed and flow.sender == chosen.node:
+                if renamed and flow.key.sender == chosen.node:
                     message = (
                         f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
                     )
@@ -216,7 +209,7 @@ def _moved(
     grown, host = capacity.growth_by(world, after, changes), world.config.host_of(chosen.node)
     there = {need: amount for need, amount in grown.items() if need[0] == host}
     capacity.refuse_excess(usage, there, world.config)
-    return _Move(after, followed, changes, grown)
+    return after, followed, changes, grown
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from itertools import product
 from typing import NamedTuple
 
 from demandops.base import naming
-from demandops.base.errors import Fault, suggestion
+from demandops.base.errors import Fault, fault, suggestion
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.base.quoting import quoted
 from demandops.connections.connection import RouteKey
@@ -84,25 +84,19 @@ def with_further_topics(request: AnyDemand, ledger: Ledger, config: Config) -> A
             if booked is not None:
                 return booked.further
             place = (role, topic.source)
-            if place not in first and ledger.has_usual_topic(*place, except_demand=own):
+            booked_usual = ledger.keys_with("usual", topic.source, role)
+            if place not in first and any(key.demand != own for key in booked_usual):
                 return True
             usual = first.setdefault(place, topic.topic)
         return topic.topic != usual
 
-    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
     # A usual topic that is booked stays the usual one, even if the request lists it after others.
-    for app, role in product(apps, config.roles_with_services):
+    for app, role in product(request.applications, config.roles_with_services):
         for topic in app.inputs.get(role, ()):
             booked = ledger.booked_input(role, topic.source, topic.topic)
             if booked is not None and not booked.further:
                 first.setdefault((role, topic.source), topic.topic)
-    demanded = (
-        replace(item, held=_marked(item.held, config, is_further))
-        if isinstance(item.held, Application)
-        else item
-        for item in request.demanded
-    )
-    return replace(request, demanded=tuple(demanded))
+    return request.with_each(lambda app: _marked(app, config, is_further))
 
 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
@@ -153,18 +147,14 @@ class PublishedTopic(NamedTuple):
 class Flow:
     """A topic that is made on one node and needed on another node.
 
-    ``name`` is an input role of the application, or ``<service>.<output>``. ``target`` is the
-    topic's name at the receiver. ``root`` is the key of the demanded topic because of which the
-    flow is needed; it is empty for a delivery, and if no single topic needs the flow. ``delivery``
-    is the position in ``deliver`` of the delivery that needs the flow. ``type`` is the message
-    type; it is empty unless the demand names the type.
+    ``name`` is an input role of the application, or ``<service>.<output>``. ``root`` is the key of
+    the demanded topic because of which the flow is needed; it is empty for a delivery, and if no
+    single topic needs the flow. ``delivery`` is the position in ``deliver`` of the delivery that
+    needs the flow. ``type`` is the message type; it is empty unless the demand names the type.
     """
 
     name: str
-    topic: str
-    sender: str
-    receiver: str
-    target: str
+    key: RouteKey
     root: TopicKey = ()
     delivery: int | None = None
     type: str = ""
@@ -244,25 +234,24 @@ def flows(config: Config, app: Application) -> list[Flow]:
     """Return the flows between nodes by ``name``; a node that is not chosen yet is empty."""
     services = config.services.get(app.appdef, {})
     # Several services of one node may read a topic, but it must come to the node only once.
-    needed: dict[tuple[str, str, str, str], Flow] = {}
+    needed: dict[RouteKey, Flow] = {}
     for service in services.values():
         for node, part in _parts(app, service):
             for origin in service.inputs.values():
                 for topic, sender, root in topics_of_origin(config, part, origin):
                     if sender != node:
                         cause = root or (next(part.topic_keys()) if service.roots else ())
-                        name = topic.topic
-                        flow = Flow(origin, name, sender, node, name, cause, type=topic.type)
-                        needed.setdefault((name, sender, node, name), flow)
+                        key = RouteKey(sender, topic.topic, node, topic.topic)
+                        needed.setdefault(key, Flow(origin, key, cause, type=topic.type))
     for index, delivery in enumerate(app.deliver):
         producer, _, output = delivery.output.partition(".")
         if producer not in services or output not in services[producer].outputs:
             continue  # admission reports an unknown output
         for topic, sender, _ in topics_of_origin(config, app, delivery.output):
-            name, target = topic.topic, delivery.topic or topic.topic
-            if (sender, name) != (delivery.node, target):
-                flow = Flow(delivery.output, name, sender, delivery.node, target, delivery=index)
-                needed.setdefault((name, sender, delivery.node, target), flow)
+            target = delivery.topic or topic.topic
+            key = RouteKey(sender, topic.topic, delivery.node, target)
+            if key[:2] != key[2:]:
+                needed.setdefault(key, Flow(delivery.output, key, delivery=index))
     return sorted(needed.values(), key=lambda flow: flow.name)
 
 
@@ -291,10 +280,8 @@ def is_bridged(key: RouteKey, config: Config) -> bool:
 
 def flows_without_carrier(config: Config, app: Application, ledger: Ledger) -> Iterator[Flow]:
     for flow in flows(config, app):
-        key = RouteKey(flow.sender, flow.topic, flow.receiver, flow.target)
-        if not ledger.ids_with("brings", flow.receiver, flow.target) and not is_bridged(
-            key, config
-        ):
+        is_brought = ledger.ids_with("brings", flow.key.receiver, flow.key.target)
+        if not is_brought and not is_bridged(flow.key, config):
             yield flow
 
 
@@ -305,14 +292,8 @@ def flows_without_carrier(config: Config, app: Application, ledger: Ledger) -> I
 # like any other, marked with who reads it.
 
 
-class _Problem(NamedTuple):
-    field: str
-    message: str
-    code: str = "invalid"
-
-
 def reads_outputs(request: Demand) -> bool:
-    return request.adds_claims and any(app.read_outputs for app in _listed(request).values())
+    return request.adds_claims and any(app.read_outputs for app in request.applications)
 
 
 def with_topics_of_outputs(
@@ -353,13 +334,13 @@ def with_topics_of_outputs(
         remedy = "read none that depends on this application's own"
         return request, [item.fault("inputs", f"{message}; {remedy}", code="conflict")]
 
-    def producer(name: str) -> Application | _Problem:
+    def producer(name: str) -> Application | Fault:
         id = id_of(name)
         if app := listed.get(id) or _as_booked(id, request.demand, ledger, config):
             return app
         close = suggestion(name, {*listed, *ledger.subjects(SubjectKind.APPLICATION)})
         message = f"{quoted(name)} is neither listed in this demand nor booked{close}"
-        return _Problem(".application", message, "unknown-application")
+        return fault(".application", message, code="unknown-application")
 
     # First those that read no outputs, then those that read only theirs, and so on.
     faults, complete = list[Fault](), dict[int, Item]()
@@ -369,7 +350,7 @@ def with_topics_of_outputs(
             if isinstance(item.held, Application) and item.held.id in ready:
                 app, problems = _with_topics(item.held, producer, config)
                 complete[index] = replace(item, held=app)
-                faults += (item.fault(field, text, code=code) for field, text, code in problems)
+                faults += (item.fault(p.field, p.message, code=p.code) for p in problems)
         marked = replace(request, demanded=tuple(complete.values()))
         marked = with_further_topics(marked, ledger, config)
         complete = dict(zip(complete, marked.demanded, strict=True))
@@ -379,14 +360,13 @@ def with_topics_of_outputs(
 
 
 def _listed(request: Demand) -> dict[str, Application]:
-    apps = (item.held for item in request.demanded if isinstance(item.held, Application))
-    return {app.id: app for app in apps}
+    return {app.id: app for app in request.applications}
 
 
 def _with_topics(
-    app: Application, producer: Callable[[str], Application | _Problem], config: Config
-) -> tuple[Application, list[_Problem]]:
-    problems, inputs = list[_Problem](), dict[str, tuple[InputTopic, ...]]()
+    app: Application, producer: Callable[[str], Application | Fault], config: Config
+) -> tuple[Application, list[Fault]]:
+    problems, inputs = list[Fault](), dict[str, tuple[InputTopic, ...]]()
     for role, topics in app.inputs.items():
         kept, more, read = list[InputTopic](), list[InputTopic](), set[tuple[str, str]]()
         for index, topic in enumerate(topics):
@@ -396,8 +376,9 @@ def _with_topics(
             elif output not in read:
                 read.add(output)
                 made = _topics_of(topic, producer(topic.application), config)
-                if isinstance(made, _Problem):
-                    problems.append(made._replace(field=f"inputs.{role}[{index}]{made.field}"))
+                if isinstance(made, Fault):
+                    where = f"inputs.{role}[{index}]{made.field}"
+                    problems.append(replace(made, field=where))
                     made = [each for each in topics if (each.application, each.output) == output]
                 kept.append(made[0])
                 more += made[1:]  # at the end, so that the others keep their places in the demand
@@ -406,10 +387,10 @@ def _with_topics(
 
 
 def _topics_of(
-    read: InputTopic, app: Application | _Problem, config: Config
-) -> list[InputTopic] | _Problem:
-    if isinstance(app, _Problem) or app.appdef not in config.services:
-        return app if isinstance(app, _Problem) else [read]  # admission reports its type
+    read: InputTopic, app: Application | Fault, config: Config
+) -> list[InputTopic] | Fault:
+    if isinstance(app, Fault) or app.appdef not in config.services:
+        return app if isinstance(app, Fault) else [read]  # admission reports its type
     services = config.services[app.appdef].values()
     outputs = [f"{service.name}.{output}" for service in services for output in service.outputs]
     meant = [each for each in outputs if read.output in (each, each.partition(".")[2])]
@@ -417,12 +398,12 @@ def _topics_of(
         close = suggestion(read.output, outputs) or f"; {app.appdef} has none"
         several = f"is an output of several services; write {' or '.join(meant)}"
         problem = several if meant else f"is not an output of {quoted(app.id)}{close}"
-        return _Problem(".output", f"{quoted(read.output)} {problem}")
+        return fault(".output", f"{quoted(read.output)} {problem}")
     message = f"{meant[0]} of {quoted(app.id)} has no topic, because nothing is demanded for it"
     return [
         InputTopic(made.topic.topic, made.node, read.type, False, app.id, meant[0])
         for made in topics_of_origin(config, app, meant[0])
-    ] or _Problem(".output", f"{message}; demand that first, or name another output")
+    ] or fault(".output", f"{message}; demand that first, or name another output")
 
 
 def _as_booked(id: str, demand: str, ledger: Ledger, config: Config) -> Application | None:
@@ -476,9 +457,11 @@ def without_idle_holds(
     for demand in dict.fromkeys(change.key.demand for change in changes if change.before):
         while idle := [  # again, because what was held may have held more
             (claim, readers)
-            for claim in ledger.claims_of_demand(demand)
+            for claims in [ledger.claims_of_demand(demand)]
+            for holding in [{claim.subject.id for claim in claims if claim.is_on_application}]
+            for claim in claims
             if claim.is_on_application and (held_for := claim.application.held_for)
-            for readers in [{id: held_for[id] for id in held_for if _has(ledger, demand, id)}]
+            for readers in [{id: held_for[id] for id in held_for if id in holding}]
             if readers != held_for
         ]:
             for claim, readers in idle:
@@ -488,18 +471,14 @@ def without_idle_holds(
     return ledger, keys
 
 
-def _has(ledger: Ledger, demand: str, application: str) -> bool:
-    return ledger.get(ClaimKey(Subject(SubjectKind.APPLICATION, application), demand)) is not None
-
-
 def with_booked_outputs(
     app: Application, demand: str, ledger: Ledger, config: Config
 ) -> Application:
     """Return a booked application with the topics that the outputs it reads have in ``ledger``."""
 
-    def producer(id: str) -> Application | _Problem:
+    def producer(id: str) -> Application | Fault:
         claim = ledger.get(ClaimKey(Subject(SubjectKind.APPLICATION, id), demand))
-        return claim.application if claim else _Problem("", "")
+        return claim.application if claim else fault("", "")
 
     item = Item(_with_topics(app, producer, config)[0], ())
     put = with_further_topics(Demand("put", demand=demand, demanded=(item,)), ledger, config)

@@ -13,7 +13,7 @@ from demandops.model.config.policy import matches
 from demandops.model.demand.demand import Application, Item
 from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim, ClaimKey, requesters_of
 from demandops.model.ledger.ledger import By, Ledger, World
-from demandops.model.release import Release, ServiceRelease, claims_of, overridden
+from demandops.model.release import Release, ServiceRelease, claims_of
 
 # ---- effects on claims: ``deny`` suspends claims, ``keep`` books further claims ----
 #
@@ -269,8 +269,11 @@ def apply_effects(
         if "version" in effects:
             chart = config.charts[release.service.chart].at(str(override.version))
             release = replace(release, chart=chart or release.chart)
-        if "replicas" in effects and override.replicas is not None:
-            replicas = overridden(release.replicas, override.replicas)
+        if "replicas" in effects and (number := override.replicas) is not None:
+            # Where an autoscaler owns the number, the manifest tells the GitOps controller to
+            # ignore ``spec.replicas``. So the number is set as both bounds of the autoscaler.
+            scaler = release.autoscaler
+            replicas = replace(scaler, min=number, max=number) if scaler else number
             release = replace(release, replicas=replicas)
         if "node" in effects:
             node, domain = config.node_and_domain(str(override.node))

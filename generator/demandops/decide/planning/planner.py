@@ -77,9 +77,7 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
             read |= {made.topic for made in topics_of_origin(config, part, origin)}
         # Only some demands name the message type of a topic. An entry without the type sorts first,
         # so the entry with the type replaces it here.
-        inputs[role] = tuple(
-            {(t.topic, t.source): t for t in sorted(read, key=lambda t: t.order)}.values()
-        )
+        inputs[role] = tuple({(t.topic, t.source): t for t in sorted(read)}.values())
     # If claims have several values of a parameter, the definition says how they are merged.
     parameters: dict[str, object] = {}
     for name, parameter in sorted(service.parameters.items()):
@@ -132,13 +130,14 @@ def _parts(
             continue
         roles = service.roots or {role for app in same for role in app.inputs}
         inputs = {
-            role: {topic for app in same for topic in app.inputs.get(role, ())} for role in roles
-        }
-        if service.roots:
-            inputs = {
-                role: {topic for topic in topics if topic.source == key.node}
-                for role, topics in inputs.items()
+            role: {
+                topic
+                for app in same
+                for topic in app.inputs.get(role, ())
+                if not service.roots or topic.source == key.node
             }
+            for role in roles
+        }
         yield first.with_inputs({role: tuple(topics) for role, topics in inputs.items()})
 
 

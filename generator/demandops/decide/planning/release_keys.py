@@ -127,7 +127,7 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
         needed = _service(world, key.application, key) is not None
         return ledger.application_claims(key.application) if needed else ()
     if key.for_cluster:
-        users = world.config.users_of(key.service)
+        users = (name for name, own in world.config.services.items() if key.service in own)
         claims = tuple(claim for name in users for claim in ledger.claims_with("definition", name))
     elif key.scope == "node":
         claims = ledger.claims_with("node", key.node)

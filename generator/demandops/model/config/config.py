@@ -201,27 +201,6 @@ class Config:
             raise Refused.at("node", message, code="unknown-node", file=file)
         return node, domain
 
-    def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
-        for appdef in self.appdefs.values():
-            if appdef.deployment_request and appdef.deployment_request.type == number:
-                return appdef
-        return None
-
-    def versions_file(self, appdef: str) -> str:
-        if appdef in self.versions:
-            return self.file_of(VERSIONS_FILE, appdef)
-        return self.place_of(CHARTS_FILE)
-
-    def users_of(self, service: str) -> list[str]:
-        return [appdef for appdef, services in self.services.items() if service in services]
-
-    def parameters_of(self, appdef: str) -> set[str]:
-        services = self.services[appdef].values()
-        return {
-            *self.appdefs[appdef].parameters,
-            *(name for s in services for name in s.parameters),
-        }
-
     def values_template(self, service: Service) -> str:
         return f"appdefs/{service.folder}/{service.values}"
 
@@ -239,12 +218,13 @@ class ConfigReader:
         self.files = files
         self.faults: list[Fault] = []
         self._counts = Counter[str]()
-        self._by_collection = defaultdict[str | None, list[str]](list)
+        self.files_of = defaultdict[str | None, list[str]](list)  # by collection
         for path in sorted(files):
-            self._by_collection[collection_of(path)].append(path)
+            self.files_of[collection_of(path)].append(path)
         # The file and the path of each item, by collection and name
         self.places: dict[str, dict[str, tuple[str, str]]] = {}
-        self._incomplete: set[str] = set()
+        # The collections with items that are not valid
+        self.incomplete: set[str] = set()
         # The valid files with items, but without the items
         self.heads: dict[str, BaseModel] = {}
 
@@ -263,9 +243,6 @@ class ConfigReader:
             self.faults += error.faults
             return None
 
-    def files_of(self, collection: str) -> list[str]:
-        return self._by_collection[collection]
-
     def read_items(
         self, collection: str, whole: type[BaseModel], field: str, item: type[Model], key: str = ""
     ) -> dict[str, Model]:
@@ -277,7 +254,7 @@ class ConfigReader:
         items: dict[str, Model] = {}
         places = self.places[collection] = {}
         kind: type[Any] = list if key else dict
-        for file in self.files_of(collection) or [collection]:
+        for file in self.files_of[collection] or [collection]:
             entries: Any = None
             try:
                 data = strict_yaml.load(self.files.get(file, ""), file)
@@ -292,7 +269,7 @@ class ConfigReader:
             except InvalidInput as error:
                 self.faults += error.faults
             if entries is None:
-                self._incomplete.add(collection)
+                self.incomplete.add(collection)
                 continue
             for place, entry in enumerate(entries) if key else entries.items():
                 name: Any = place
@@ -306,7 +283,7 @@ class ConfigReader:
                 parsed = self._valid(item.model_validate, entry, item, file, at)
                 label = key or self._valid(_NAME.validate_python, name, item, file, at)
                 if parsed is None or label is None:
-                    self._incomplete.add(collection)
+                    self.incomplete.add(collection)
                 else:
                     items[name], places[name] = parsed, (file, field_path(at))
         return items
@@ -324,25 +301,13 @@ class ConfigReader:
         for (file, place), (other, _) in ((first, second), (second, first)):
             self.add_fault(file, f"{place}{dot_key}", f"'{name}' is in {other} too; remove one")
 
-    def entry_files(self) -> dict[str, dict[str, str]]:
-        return {
-            collection: {name: file for name, (file, _) in places.items()}
-            for collection, places in self.places.items()
-        }
-
-    def place_of(self, collection: str, name: str) -> tuple[str, str]:
-        return self.places[collection][name]
-
-    def is_complete(self, collection: str) -> bool:
-        return collection not in self._incomplete
-
     def is_missing(self, collection: str, name: str) -> bool:
         # an invalid item may be the missing one, and has faults of its own
-        return self.is_complete(collection) and name not in self.places[collection]
+        return collection not in self.incomplete and name not in self.places[collection]
 
     def check_reference(self, file: str, field: str, name: str, collection: str) -> None:
         if self.is_missing(collection, name):
-            where = place_of_collection(collection, self.files_of(collection))
+            where = place_of_collection(collection, self.files_of[collection])
             where = where.replace("inventory/", "")
             # thousands of names may be unknown, and only the first faults of a file are listed
             is_listed = self._counts[file] < errors.MOST_FAULTS

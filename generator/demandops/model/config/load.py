@@ -16,48 +16,19 @@ from typing import TypeVar
 from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION, RENDER_VERSION
+from demandops.model.config import config as configs
+from demandops.model.config import inventory, registry
 from demandops.model.config.appdef import (
     ApplicationDefinition,
     ServiceDefinition,
     Services,
     resolved_services,
 )
-from demandops.model.config.config import (
-    BROKERS_FILE,
-    CHARTS_FILE,
-    CLIENTS_FILE,
-    CLUSTERS_FILE,
-    COLLECTIONS,
-    DOMAINS_FILE,
-    IMAGES_FILE,
-    NODES_FILE,
-    VERSIONS_FILE,
-    Config,
-    ConfigReader,
-    collection_of,
-)
+from demandops.model.config.config import Config, ConfigReader
 from demandops.model.config.cross_check import cross_check
-from demandops.model.config.inventory import (
-    Broker,
-    BrokersFile,
-    Cluster,
-    ClustersFile,
-    Node,
-    NodesFile,
-    id_in_domain,
-)
+from demandops.model.config.inventory import Node, id_in_domain
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.model.config.policy import AccessDomain, AccessDomainsFile, matches
-from demandops.model.config.registry import (
-    DEFAULT_SETTINGS,
-    Chart,
-    ChartsFile,
-    ClientsFile,
-    Image,
-    ImagesFile,
-    VersionList,
-    VersionsFile,
-)
 from demandops.model.config.repo_settings import ROOT_FILE, Flux, RepoSettings
 
 Definition = TypeVar("Definition", ApplicationDefinition, ServiceDefinition)
@@ -90,17 +61,19 @@ def load(files: Mapping[str, str]) -> Config:
         )
         reader.add_fault(ROOT_FILE, repository.gitops, message)
     _refuse_unread(reader)
-    nodes = reader.read_items(NODES_FILE, NodesFile, "nodes", Node, "id")
-    domains = reader.read_items(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
+    nodes = reader.read_items(configs.NODES_FILE, inventory.NodesFile, "nodes", Node, "id")
+    domains = reader.read_items(
+        configs.DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name"
+    )
     appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
     services = {
         name: _services_of(appdef, definitions, nodes.values(), reader)
         for name, appdef in appdefs.items()
     }
-    clients, client_files = DEFAULT_SETTINGS, dict[str, str]()
-    for file in reader.files_of(CLIENTS_FILE):
-        part = reader.read_file(file, ClientsFile)
+    clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
+    for file in reader.files_of[configs.CLIENTS_FILE]:
+        part = reader.read_file(file, registry.ClientsFile)
         words = part.model_fields_set - {"apiVersion", "kind"} if part else set()
         for word in sorted(words):
             first = client_files.setdefault(word, file)
@@ -109,17 +82,27 @@ def load(files: Mapping[str, str]) -> Config:
             clients = clients.model_copy(update={word: getattr(part, word)})
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
-    clusters = reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name")
-    brokers = reader.read_items(BROKERS_FILE, BrokersFile, "brokers", Broker, "node")
-    charts = reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart)
-    images = reader.read_items(IMAGES_FILE, ImagesFile, "images", Image)
+    clusters = reader.read_items(
+        configs.CLUSTERS_FILE, inventory.ClustersFile, "clusters", inventory.Cluster, "name"
+    )
+    brokers = reader.read_items(
+        configs.BROKERS_FILE, inventory.BrokersFile, "brokers", inventory.Broker, "node"
+    )
+    charts = reader.read_items(configs.CHARTS_FILE, registry.ChartsFile, "charts", registry.Chart)
+    images = reader.read_items(configs.IMAGES_FILE, registry.ImagesFile, "images", registry.Image)
     for name, image in images.items():
-        head = reader.heads.get(reader.place_of(IMAGES_FILE, name)[0])
-        if isinstance(head, ImagesFile) and head.registry is not None:
+        head = reader.heads.get(reader.places[configs.IMAGES_FILE][name][0])
+        if isinstance(head, registry.ImagesFile) and head.registry is not None:
             images[name] = image.pulled_from(head.registry)
-    versions: Mapping[str, VersionList] = {}
-    if reader.files_of(VERSIONS_FILE):  # unlike the other collections, this one may have no file
-        versions = reader.read_items(VERSIONS_FILE, VersionsFile, "applications", VersionList)
+    versions: Mapping[str, registry.VersionList] = {}
+    if reader.files_of[configs.VERSIONS_FILE]:  # this collection alone may have no file
+        versions = reader.read_items(
+            configs.VERSIONS_FILE, registry.VersionsFile, "applications", registry.VersionList
+        )
+    entry_files: dict[str, dict[str, str]] = {
+        collection: {name: file for name, (file, _) in places.items()}
+        for collection, places in reader.places.items()
+    }
     config = Config(
         repo_settings=repository or _ANY,
         clusters=clusters,
@@ -137,7 +120,7 @@ def load(files: Mapping[str, str]) -> Config:
         hosts=hosts,
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
         overrides=_read_overrides(reader),
-        entry_files={**reader.entry_files(), CLIENTS_FILE: client_files},
+        entry_files={**entry_files, configs.CLIENTS_FILE: client_files},
     )
     cross_check(config, reader)
     if reader.faults:
@@ -147,13 +130,15 @@ def load(files: Mapping[str, str]) -> Config:
 
 def _refuse_unread(reader: ConfigReader) -> None:
     # whoever mistypes a file's name must not believe that its entries are in force
-    folders = {collection.partition("/")[0] for collection in COLLECTIONS}
+    folders = {collection.partition("/")[0] for collection in configs.COLLECTIONS}
     for path in sorted(reader.files):
         folder, *names = path.split("/")
         if folder not in folders or not path.endswith((".yaml", ".yml")):
             continue
-        if collection_of(path) is None and not any(name.startswith(".") for name in names):
-            stems = [PurePosixPath(file).stem for file in COLLECTIONS if file.startswith(folder)]
+        if configs.collection_of(path) is None and not any(name.startswith(".") for name in names):
+            stems = [
+                PurePosixPath(file).stem for file in configs.COLLECTIONS if file.startswith(folder)
+            ]
             message = (
                 f"is not read; only <name>.yaml and <name>/*.yaml in {folder}/ are read, where "
                 f"<name> is one of {', '.join(sorted(stems))}; rename the file, or remove it"
@@ -248,17 +233,17 @@ def _in_further_domains(
     # data of two domains.
     nodes, domain_of, hosts = dict(nodes), dict(domain_of), dict[str, str]()
     for node in [node for node in nodes.values() if node.access_domains]:  # `nodes` grows
-        file, place = reader.place_of(NODES_FILE, node.id)
+        file, place = reader.places[configs.NODES_FILE][node.id]
         first = domain_of.get(node.id)
         ros = {_in_ros_domain(node, first).ros.domain_id: first.name} if first else {}
         for index, further in enumerate(node.access_domains):
             where, id = f"{place}.accessDomains[{index}]", id_in_domain(node.id, further.name)
             domain = domains.get(further.name)
-            reader.check_reference(file, f"{where}.name", further.name, DOMAINS_FILE)
+            reader.check_reference(file, f"{where}.name", further.name, configs.DOMAINS_FILE)
             if first is None:
                 # the node may be in an invalid domain, or in several, which has a fault of its own
                 is_matched = any(matches(node.id, d.nodes) for d in domains.values())
-                if not is_matched and reader.is_complete(DOMAINS_FILE):
+                if not is_matched and configs.DOMAINS_FILE not in reader.incomplete:
                     message = f"no access domain has '{node.id}' in its nodes; add it to one"
                     reader.add_fault(file, where, message)
             elif domain is first or id in nodes:
@@ -273,12 +258,13 @@ def _in_further_domains(
                     message = (
                         f"access domains '{other}' and '{domain.name}' share ROS domain {number}, "
                         f"so each would read the other's topics on '{node.id}'; give one of them "
-                        "'ros: {domainId: …}' in " + reader.place_of(DOMAINS_FILE, domain.name)[0]
+                        "'ros: {domainId: …}' in "
+                        + reader.places[configs.DOMAINS_FILE][domain.name][0]
                     )
                     reader.add_fault(file, f"{where}.name", message)
                 # the first domain keeps the plain name, so a further one changes nothing that runs
                 nodes[id], domain_of[id], hosts[id] = node.in_domain(further), domain, node.id
-                reader.places[NODES_FILE][id] = (file, place)
+                reader.places[configs.NODES_FILE][id] = (file, place)
     return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
 
 
@@ -310,10 +296,10 @@ def _domains_of_nodes(
                 break
         if len(matching) > 1:  # an overlap by accident must not move the node
             by = " and ".join(
-                f"'{name}' by {quoted(pattern)} in {reader.place_of(DOMAINS_FILE, name)[0]}"
+                f"'{name}' by {quoted(pattern)} in {reader.places[configs.DOMAINS_FILE][name][0]}"
                 for name, pattern in sorted(matching.items())[:_MOST_DOMAINS]
             )
-            file, place = reader.place_of(NODES_FILE, node)
+            file, place = reader.places[configs.NODES_FILE][node]
             message = (
                 f"'{node}' is in the access domains {by}; narrow these patterns so that only one "
                 "domain matches the node, and list the other domains under 'accessDomains' of the "

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import re
 from bisect import bisect_left
-from collections.abc import Container, Hashable, Iterator, Mapping
+from collections.abc import Callable, Container, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta, timezone
 from functools import cached_property
@@ -41,7 +41,7 @@ from demandops.model.config.inventory import Position, read_condition
 # ---- applications ----
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, order=True)
 class InputTopic:
     """An input topic of an application, and the node that publishes it.
 
@@ -62,10 +62,6 @@ class InputTopic:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "topic", absolute_topic(self.topic))
-
-    @property
-    def order(self) -> tuple[str, str, str, bool, str, str]:
-        return self.topic, self.source, self.type, self.further, self.application, self.output
 
     def part_in(self, version: str) -> str:
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
@@ -102,10 +98,6 @@ def _property_problem(text: str) -> str:
     return f"{quoted(text)} is not a property; write name=value, name>=8 or name<=8"
 
 
-def _capability_problem(text: str) -> str:
-    return "" if text else "is empty; name a capability, or leave it out"
-
-
 @dataclass(frozen=True, slots=True)
 class Requirement:
     """Requirements on a node; ``labels`` are texts like ``zone=north``.
@@ -117,7 +109,11 @@ class Requirement:
 
     role: str = ""
     labels: Items[Annotated[str, without(_label_problem)]] = ()
-    capabilities: Items[Annotated[str, without(_capability_problem)]] = ()
+    capabilities: Items[
+        Annotated[
+            str, without(lambda t: "" if t else "is empty; name a capability, or leave it out")
+        ]
+    ] = ()
     properties: Items[Annotated[str, without(_property_problem)]] = ()
 
     @property
@@ -164,10 +160,6 @@ def _read_connect(value: object) -> object:
     return value if isinstance(value, dict | Connect) else Connect(_CONNECT.func(value))  # type: ignore[call-arg]
 
 
-def _written_connect(connect: Connect) -> object:
-    return {"type": connect.type, "broker": connect.broker} if connect.broker else connect.type
-
-
 @dataclass(frozen=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     """One application: its id, type (the name of an appdef), node and inputs by role.
@@ -190,7 +182,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         BeforeValidator(
             _read_connect, json_schema_input_type=_CONNECT.json_schema_input_type | Connect
         ),
-        PlainSerializer(_written_connect),
+        PlainSerializer(lambda c: {"type": c.type, "broker": c.broker} if c.broker else c.type),
     ] = Connect()
     deliver: Items[Delivery] = ()
     # The requirements on the node, kept to choose again; None if the demand names the node. A place
@@ -403,19 +395,6 @@ def _before_unstarted(moment: datetime) -> datetime:
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
-    seconds: int  # the requested lease
-    slack: int = 0
-    # the lease starts when a person approves the request, not when the request is received
-    on_approval: bool = False
-
-    def lease_from(self, now: datetime) -> Lease:
-        if self.on_approval:
-            return Lease(self.seconds, self.slack, UNSTARTED)
-        return Lease(self.seconds, self.slack, now + timedelta(seconds=self.seconds))
-
-
-@dataclass(frozen=True, slots=True)
 class Lease:
     __pydantic_config__: ClassVar = PART
 
@@ -427,11 +406,6 @@ class Lease:
     def has_started(self) -> bool:
         return self.until < UNSTARTED
 
-    def started(self, now: datetime, before: Lease | None = None) -> Lease:
-        term = Term(self.seconds, self.slack)
-        # the approval of a changed demand renews its lease, which never ends earlier than before
-        return before.renewed(term, now) if before else term.lease_from(now)
-
     @property
     def expires_at(self) -> datetime:
         return self.until + timedelta(seconds=self.slack)
@@ -439,14 +413,17 @@ class Lease:
     def has_ended(self, now: datetime) -> bool:
         return self.expires_at < now
 
-    def renewed(self, term: Term, now: datetime) -> Lease:
-        wanted = term.lease_from(now)
-        same_term = (self.seconds, self.slack) == (term.seconds, term.slack)
+    def started(self, now: datetime, before: Lease | None = None) -> Lease:
+        """Return the lease as it begins now, or as it renews the one that the claim had before."""
+        wanted = replace(self, until=now + timedelta(seconds=self.seconds))
+        if before is None:
+            return wanted
+        same_term = (self.seconds, self.slack) == (before.seconds, before.slack)
         # a thousand vehicles renew every few minutes, and not each renewal may make a commit
-        if same_term and wanted.until <= self.expires_at:
-            return self
+        if same_term and wanted.until <= before.expires_at:
+            return before
         # the end never moves to an earlier time, because the clock may have been set back
-        return replace(wanted, until=max(wanted.until, self.until))
+        return replace(wanted, until=max(wanted.until, before.until))
 
 
 # ---- demands ----
@@ -467,7 +444,7 @@ class Item:
     # connection. Of one that the demand does not list, all faults are reported there.
     places: tuple[str, ...] = ()
     is_listed: bool = True
-    term: Term | None = None
+    lease: Lease | None = None  # which has not started
     # a sentence for each placed application or service: which node was chosen, and why
     placed: tuple[str, ...] = ()
 
@@ -512,6 +489,8 @@ class Demand:
     priority: int = 0  # among the demands that wait for room
     # Whether it has all that a demand may leave open, and is admitted. The generator's own are.
     is_complete: bool = False
+    # its leases start when a person approves it, not when it is received
+    awaits_approval: bool = False
     # how what is booked differs from what was demanded, for warnings in the receipt
     notes: tuple[str, ...] = ()
     # the goal as plain data, which the journal keeps
@@ -530,6 +509,19 @@ class Demand:
     def is_release(self) -> bool:  # by the party that demanded
         return self.operation in ("release", "shutdown")
 
+    @property
+    def applications(self) -> tuple[Application, ...]:
+        helds = (item.held for item in self.demanded)
+        return tuple(held for held in helds if isinstance(held, Application))
+
+    def with_each(self: AnyDemand, change: Callable[[Application], Application]) -> AnyDemand:
+        """Return the demand with a change of each application."""
+        demanded = (
+            replace(item, held=change(item.held)) if isinstance(item.held, Application) else item
+            for item in self.demanded
+        )
+        return replace(self, demanded=tuple(demanded))
+
     def requesters(self) -> tuple[str, ...]:
         listed = (who for item in self.demanded for who in item.requesters)
         return tuple(dict.fromkeys((*self.own_requesters, *listed)))
@@ -539,7 +531,7 @@ class Demand:
 
     def listed_subjects(self) -> set[Subject]:
         """Return the subjects that the goal lists, whatever connections carry their topics."""
-        listed = {item.held.subject for item in self.demanded if isinstance(item.held, Application)}
+        listed = {app.subject for app in self.applications}
         for item in self.demanded:
             for route in item.held.topics if isinstance(item.held, Connection) else ():
                 if not route.implied:
@@ -551,8 +543,8 @@ class Demand:
         """Return what keeps demands that share it in their order; None touches everything."""
         if self.operation in ("decommission", "rollback"):
             return None
-        apps = (item.held for item in self.demanded if isinstance(item.held, Application))
-        read = (Subject(SubjectKind.APPLICATION, id) for app in apps for id in app.read_outputs)
+        ids = (id for app in self.applications for id in app.read_outputs)
+        read = (Subject(SubjectKind.APPLICATION, id) for id in ids)
         own = [("demand", self.demand)] if self.demand else []
         return frozenset((*self.subjects(), *read, *own))
 

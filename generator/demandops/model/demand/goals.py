@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
 
@@ -117,16 +117,15 @@ class DemandGoal(FrozenModel):
 
     def read(self) -> Demand:
         requesters = tuple(self.requesters)
-        lists: tuple[tuple[str, tuple[Held, ...]], ...] = (
-            ("applications", self.applications),
-            ("connections", self.connections),
-        )
+        # the services whose node the demand names
+        apps = (replace(app, named=tuple(sorted(app.services))) for app in self.applications)
+        lists: dict[str, Iterable[Held]] = {"applications": apps, "connections": self.connections}
         return Demand(
             self.operation,
             self.request or self.demand,
             tuple(
-                Item(_named(held), requesters, f"{name}[{index}]")
-                for name, listed in lists
+                Item(held, requesters, f"{name}[{index}]")
+                for name, listed in lists.items()
                 for index, held in enumerate(listed)
             ),
             self.demand,
@@ -135,12 +134,6 @@ class DemandGoal(FrozenModel):
             {each.node: Position(x=each.x, y=each.y) for each in self.positions},
             self.priority,
         )
-
-
-def _named(held: Held) -> Held:
-    if not isinstance(held, Application):
-        return held
-    return replace(held, named=tuple(sorted(held.services)))  # those whose node the demand names
 
 
 def _with_parameters(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:

@@ -257,7 +257,8 @@ def _of_older_version(data: dict[str, Any]) -> dict[str, Any]:
     held["id"] = data.get(on, "")
     if on == "application":
         held["type"] = data.get("definition", "")
-        for topics in _values(held.get("inputs")):
+        inputs = held.get("inputs")
+        for topics in inputs.values() if isinstance(inputs, dict) else ():
             for topic in topics if isinstance(topics, list) else ():
                 if isinstance(topic, dict):
                     topic.pop("requesters", None)
@@ -274,7 +275,3 @@ def _of_older_version(data: dict[str, Any]) -> dict[str, Any]:
             routes.append({"source": source, **route})
         held["topics"] = routes
     return {"apiVersion": LEDGER_API_VERSION, "kind": "Claim", **claim, on: held}
-
-
-def _values(mapping: object) -> Iterator[Any]:
-    yield from mapping.values() if isinstance(mapping, dict) else ()

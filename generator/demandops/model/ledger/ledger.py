@@ -25,6 +25,7 @@ from demandops.model.ledger.records import WaitingDemands
 # A :class:`Ledger` never changes, because each request makes a new one.
 
 _DEMAND = attrgetter("demand")
+_BY_SUBJECT = attrgetter("subject.kind.value", "subject.id", "demand")
 
 Entry: TypeAlias = "tuple[str, ...]"
 # The first word of an entry: by what a claim is found. The further words name it.
@@ -80,10 +81,6 @@ class Ledger:
         held = self.claims.get(subject)
         return held[0] if held else None
 
-    def held(self, subject: Subject) -> Application | Connection | None:
-        first = self.first_claim(subject)
-        return first.held if first else None
-
     def application_claims(self, application: str) -> tuple[Claim, ...]:
         return self.claims_on(Subject(SubjectKind.APPLICATION, application))
 
@@ -116,11 +113,14 @@ class Ledger:
         return (claim for key in self.keys_with(by, *words) if (claim := self.get(key)))
 
     def claims_with(self, by: By, *words: str) -> tuple[Claim, ...]:
-        keys = sorted(
-            self.keys_with(by, *words),
-            key=lambda key: (key.subject.kind.value, key.subject.id, key.demand),
-        )
+        keys = sorted(self.keys_with(by, *words), key=_BY_SUBJECT)
         return tuple(claim for key in keys if (claim := self.get(key)))
+
+    def claims_needing(self, node: str) -> tuple[Claim, ...]:
+        keys = {*self.keys_with("node", node), *self.keys_with("broker", node)}
+        for kind in connection_types.CONNECTION_TYPES:
+            keys |= {*self.keys_with("link", kind.name, node)}
+        return tuple(c for key in sorted(keys, key=_BY_SUBJECT) if (c := self.get(key)))
 
     def subjects(self, kind: SubjectKind) -> list[str]:
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
@@ -130,10 +130,6 @@ class Ledger:
             if inputs := claim.application.inputs_from(role, source, topic):
                 return inputs[0]
         return None
-
-    def has_usual_topic(self, role: str, source: str, *, except_demand: str | None = None) -> bool:
-        keys = self.keys_with("usual", source, role)
-        return any(key.demand != except_demand for key in keys)
 
     def usual_topics(self, role: str, source: str, *, excluded: str) -> Iterator[str]:
         same = self.keys_with("usual", source, role, excluded)
@@ -185,13 +181,6 @@ class Ledger:
             if claim.lease and claim.lease.has_ended(now)
         ]
         return tuple(claim for _, claim in sorted(ended, key=lambda pair: pair[0]))
-
-    def connections_needing(self, node: str) -> tuple[str, ...]:
-        # those from or to a node, or that name its broker
-        ids = set(self.ids_with("broker", node))
-        for kind in connection_types.CONNECTION_TYPES:
-            ids |= {*self.ids_with("link", kind.name, node)}
-        return tuple(sorted(ids))
 
     def indexed_names(self, entry: str) -> set[str]:
         # the last text of each entry; this scans the index

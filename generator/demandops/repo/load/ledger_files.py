@@ -10,7 +10,7 @@ from pygit2 import Oid, Repository, Tree
 from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.naming import Subject
-from demandops.decide.rollback import Restoration
+from demandops.decide.booking import Restoration
 from demandops.model.demand.demand import Lease, Rollback
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import Claim, ClaimKey

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Container, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 from demandops.base.errors import DemandOpsError, Fault, InvalidInput, TurnedDown, Withdrawn
@@ -166,7 +166,7 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
 
     for ticket, decision in left:
         # a lease counts from the approval on
-        request = permission.with_leases_from_approval(decision.request)
+        request = replace(decision.request, awaits_approval=True)
         try:
             step = decide(state, request, ticket.received, read_step)
         except InvalidInput as error:
