@@ -245,9 +245,9 @@ def apply_no_override_to_what_a_demand_changes(
     return plan(before, after, *more)
 
 
-@wrong(0, CommitBatch, "_followed")
-def apply_overrides_only_to_new_demands(followed: Any, batch: Any, advance: Any, *more: Any) -> Any:
-    return followed(batch, replace(advance, config_changed=False), *more)
+@wrong(0, snapshot, "render_all")
+def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any = None) -> Any:
+    return changeset.Changeset({**(more or {})}, ())
 
 
 plant("let_the_lowest_priority_win", 16, ledger, "by_rank", in_reverse)
@@ -293,8 +293,8 @@ def refuse_before_publishing(
 
 
 @wrong(0, CommitBatch, "follow")
-def follow_nothing(_: Any, batch: Any, advance: Any, *more: Any) -> None:
-    batch.head = advance.snapshot
+def follow_nothing(_: Any, batch: Any, followed: Any, *more: Any) -> None:
+    batch.head = followed.snapshot
 
 
 @wrong(1, RemoteRepository, "publish")
@@ -324,17 +324,15 @@ plant("drop_what_a_batch_has_left", 0, Demands, "put_back", lambda *given: given
 
 
 @wrong(0, CommitBatch, "follow")
-def bring_back_what_was_deleted(
-    follow: Any, batch: Any, advance: Any, before: Any, now: Any
-) -> None:
-    ledger, files = advance.snapshot.state.ledger, {}
-    for claim in before.state.ledger:
+def bring_back_what_was_deleted(follow: Any, batch: Any, followed: Any, now: Any) -> None:
+    ledger, files = followed.snapshot.state.ledger, {}
+    for claim in followed.before.state.ledger:
         if ledger.get(claim.key) is None:
             ledger = ledger.replace(claim.key, claim)
             files[path_of(claim.key)] = text_of(claim)
-    follow(batch, advance, before, now)
+    follow(batch, followed, now)
     if files:
-        author = batch._objects[advance.snapshot.commit].author
+        author = batch._objects[followed.snapshot.commit].author
         state = replace(batch.head.state, ledger=ledger)
         batch.commit_files(files, state, "Undo\n\nRender-Version: 3\n", author, now)
 
@@ -378,7 +376,7 @@ plant(
 plant("skip_the_search_for_operations", 21, Worker, "_published_before", lambda *_: [])
 
 
-@wrong(17, snapshot, "first_snapshot")
+@wrong(17, snapshot, "start_at")
 def start_without_overrides(first: Any, *given: Any) -> Any:
     found = first(*given)
     config = replace(found.state.config, overrides={})
