@@ -133,7 +133,8 @@ class Status:
     commit: str
     rows: list[Json]  # the releases
     problems: tuple[Problem, ...]
-    in_effect: str  # which configuration is, if not that of the commit
+    configuration: str  # the commit whose configuration is in effect
+    in_effect: str  # the same for a person, if it is not that of the commit
     clusters: frozenset[str]
     not_rendered: frozenset[str]
     old_bootstraps: tuple[OldBootstrap, ...]
@@ -195,6 +196,7 @@ class Status:
             commit,
             rows,
             repo.problems_of(snapshot),
+            str(snapshot.configuration),
             in_effect(repo, snapshot) if snapshot.faults else "",
             frozenset(snapshot.state.config.clusters),
             repo.not_rendered(snapshot),
@@ -226,6 +228,7 @@ class Status:
         faults = [{"code": "invalid", **problem._asdict()} for problem in self.problems]
         return {
             "commit": self.commit,
+            "configuration": self.configuration,
             "releases": self.rows,
             "not_rendered": sorted(self.not_rendered),
             "old_bootstraps": [asdict(bootstrap) for bootstrap in self.old_bootstraps],
