@@ -145,10 +145,12 @@ def main(args: list[str] | None = None) -> None:
     # the only door of all programs: `demandops`, and the nodes that ROS starts
     open_streams()
     code = run(args)
-    try:
-        sys.stdout.flush()
-    except OutputLost:  # it is told already, and Python would tell it again at the exit
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    for number, stream in ((1, sys.stdout), (2, sys.stderr)):
+        try:
+            stream.flush()
+        # it is told already, and Python would tell it again at the exit, by another code
+        except (OutputLost, OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
     sys.exit(code)
 
 
