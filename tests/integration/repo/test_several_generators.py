@@ -5,11 +5,15 @@ from __future__ import annotations
 import subprocess
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
+from demandops.repo.git import local_repository
+from demandops.repo.git.objects import NewObjects
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
+from tests.kit.repo import Person
 from tests.kit.rig import Drivers, demand, goal, leave
 
 pytestmark = pytest.mark.synced
@@ -27,7 +31,8 @@ def test_two_processes_on_one_machine_lose_and_double_nothing(
     told = rig.listen_to_all(drivers, [drivers.start(bare, each) for each in lanes])
     sent = [each for process in lanes for lane in process for each in lane]
     answers = {name: answer for one in told for name, answer in one.answers.items()}
-    assert {answer["outcome"] for answer in answers.values()} == {"booked", "released"}
+    wrong = [each for each in answers.values() if each["outcome"] not in ("booked", "released")]
+    assert wrong == []
     assert [one.finished for one in told] == [True, True]
     assert {path.name for path in next(data_home.iterdir()).iterdir()} == {"slot-0", "slot-1"}
     rig.assert_sound(bare, verify_last=10)
@@ -44,6 +49,31 @@ def test_the_same_demand_at_two_generators_at_once_is_booked_once(
             tickets = [one.submit(goal(number)) for one in (first, second)]
             assert sorted(map(rig.outcome, tickets)) == ["booked", "unchanged"]
     assert len(rig.operations(bare)) == 10
+    rig.assert_sound(bare)
+
+
+@pytest.mark.parametrize("after", ["the tip was read", "the branch was read"])
+def test_what_another_writer_publishes_in_the_last_moment_is_not_overwritten(
+    bare: Path, person: Person, monkeypatch: pytest.MonkeyPatch, after: str
+) -> None:
+    """Between a generator's last look at main and its own move of it."""
+    places: dict[str, tuple[Any, str]] = {
+        "the tip was read": (local_repository, "needs_push"),
+        "the branch was read": (NewObjects, "packed"),
+    }
+    owner, name = places[after]
+    last, moved = getattr(owner, name), list[str]()
+
+    def then(*given: Any) -> Any:
+        if not moved:
+            moved.append("")
+            moved[:] = [person.change({"README.md": "In the last moment\n"})]
+        return last(*given)
+
+    with rig.running(bare) as generator:
+        monkeypatch.setattr(owner, name, then)
+        rig.book(generator, goal(1))
+    assert rig.git(bare, "merge-base", "--is-ancestor", moved[0], "main") == ""
     rig.assert_sound(bare)
 
 

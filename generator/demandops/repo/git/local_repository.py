@@ -95,7 +95,10 @@ class LocalRepository(StateRepository):
                 f"{self.address} got hooks or settings that only `git push` obeys; start again to "
                 "use it"
             )
+        # libgit2 moves a branch only from where this reading has found it
         reference = self.objects.references[repositories.MAIN]
+        if reference.target != expected:
+            return False
         try:
             with self.new.packed(commit):
                 reference.set_target(commit, "demandops")

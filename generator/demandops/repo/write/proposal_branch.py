@@ -87,14 +87,16 @@ class ProposalBranches:
         if self._remote is None:
             try:
                 references = self._repository.objects.references
-                now = str(references[reference].target) if reference in references else ""
+                # libgit2 moves or removes a branch only from where this reading has found it
+                found = references.get(reference)
+                now = str(found.target) if found else ""
                 if now != expected and (now or commit is not None):
                     raise BranchMoved(branch)
                 if commit is None:
-                    if now:
-                        references.delete(reference)
-                elif now:
-                    references[reference].set_target(commit, "demandops")
+                    if found:
+                        found.delete()
+                elif found:
+                    found.set_target(commit, "demandops")
                 else:
                     references.create(reference, commit)
             except (GitError, OSError) as error:
