@@ -33,7 +33,9 @@ class ClusterDomain:
     cluster: str
     name: str
     namespace: str
-    application: ObjectSelector | None = None  # Argo CD's, for the domain's folder
+    application: ObjectSelector | None = (
+        None  # the Argo CD Application that applies the domain's folder
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""A folder on this machine that one process has at a time, for its clone and its journal."""
+"""Folders on this machine: each holds the clone and the journal of one process at a time."""
 
 from __future__ import annotations
 

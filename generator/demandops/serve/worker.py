@@ -533,8 +533,8 @@ class Worker:
         """Find out by further pushes whether the commits or the writer are refused.
 
         After a refusal, half of the demands are tried, down to one. If its commit is refused while
-        another commit is accepted, the server has something against this demand, and answers it; if
-        the other is refused too, that refusal is raised, for it is of the writer.
+        another commit is accepted, the server refuses this demand, which is answered so. If the
+        other commit is refused too, the server refuses the writer, and that refusal is raised.
         """
         for ticket in batch:
             ticket.mark_maybe_published(str(self.snapshot.commit))

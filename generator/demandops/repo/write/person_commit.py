@@ -6,7 +6,6 @@ The person is author and committer, so a generator reads the commit like any oth
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -151,15 +150,19 @@ def _commit(
     details: CommitDetails,
 ) -> Oid:
     tree = repository.new.add_tree(tip.tree, files)
-    if any(path.split("/", 1)[0] in CONFIG_ROOTS for path in files):
+    changes_config = any(path.split("/", 1)[0] in CONFIG_ROOTS for path in files)
+    if changes_config:
         # what a person adds to a configuration that is not valid would not be in effect either
         _require_valid(repository, tip)
-        snapshots.config_at(repository.objects[tree].peel(Tree))
     who = commit_message.signature(*details.person, details.now)
     text = details.text
-    with suppress(InvalidInput):
-        if snapshots.config_at(tip.tree).repo_settings.signed_off_by:
+    try:
+        config = snapshots.config_at(repository.objects[tree].peel(Tree))
+        if config.repo_settings.signed_off_by:
             text = commit_message.signed_off(text, f"{who.name} <{who.email}>")
+    except InvalidInput:
+        if changes_config:
+            raise
     return repository.new.add_commit(repository.signer, (who, who), text, tree, parents)
 
 

@@ -413,8 +413,6 @@ class Approvals:
             self.branches.remove(branch, head)
             del heads.branches[branch]
 
-    # ---- the end ----
-
     def tell_of_faults(self, snapshot: Snapshot) -> None:
         """Comment on the pull requests whose merge made the configuration of main invalid."""
         forge, objects = snapshot.state.config.repo_settings.proposals, self._repository.objects
@@ -430,6 +428,8 @@ class Approvals:
         )
         for commit in snapshots.commits_to_revert(objects, snapshot):
             self._forge.comment(forge, commit, text)
+
+    # ---- the end ----
 
     def _forget(self, proposal: Proposal, closed_as: str) -> None:
         self.proposals.pop(proposal.branch, None)
