@@ -97,14 +97,15 @@ class Sandbox(ImmutableSandboxedEnvironment):
         assert finalize is not None  # noqa: S101 - our own options
 
         def written(value: object) -> object:
-            is_listing = isinstance(value, (Iterator, KeysView, ItemsView, ValuesView))
-            text = finalize(list(value) if is_listing else value)
+            if isinstance(value, (Iterator, KeysView, ItemsView, ValuesView)):
+                value = [*value]
+            text = finalize(value)
             if _ADDRESS.search(str(text)):
                 raise SecurityError("a template may write only data, and no function or method")
             return text
 
         self.finalize = written
-        self.filters = {name: self.filters[name] for name in _FILTERS} | filters
+        self.filters = {**{name: self.filters[name] for name in _FILTERS}, **filters}
         del self.tests["sameas"]  # whether two values are one object is an accident
         del self.globals["lipsum"]  # writes random text
 
