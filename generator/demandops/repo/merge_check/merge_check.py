@@ -141,7 +141,7 @@ def check(
                 *warnings.truth_warnings(files),
                 *warnings.policy_warnings(state),
                 *warnings.unmatched_pattern_warnings(state.config),
-                *warnings.misspelled_topic_warnings(state),
+                *warnings.tied_override_warnings(new.values()),
                 *warnings.unheld_output_warnings(state),
                 *edit.changed_bootstraps(wanted),
                 *(
