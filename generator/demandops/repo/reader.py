@@ -192,7 +192,7 @@ class Reader:
         for verdict in verification.verify(self._objects, commits, whole=whole):
             verdicts.append(verdict)
             progress(len(verdicts), len(commits))
-        return verification.with_signatures(self._objects, verdicts)
+        return verdicts
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
         return commit_log.history_of(self._objects, revision, path, most)

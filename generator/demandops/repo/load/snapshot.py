@@ -18,7 +18,7 @@ from datetime import datetime
 from types import MappingProxyType
 from typing import NamedTuple
 
-from pygit2 import Blob, Commit, Oid, Repository, Tree
+from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, OverLimit, StateRepoError, fault
@@ -120,7 +120,7 @@ def load(
     commit = trees.commit_of(repo, revision)
     tree, configuration = commit.tree, configuration_of(repo, commit, entry)
     config = config_at(trees.commit_of(repo, configuration).tree)
-    ledger, put_back, faults = ledger_at(repo, commit, progress, entry)
+    ledger, put_back, faults = ledger_at(repo, commit, progress)
     told = None if configuration == commit.id else config_ids(tree)
     state = State(config, ledger, EVALUATE)
     return Snapshot(
@@ -132,39 +132,25 @@ def ledger_at(
     repo: Repository,
     commit: Commit,
     progress: Progress = lambda done, total: None,
-    entry: LogEntry | None = None,
 ) -> tuple[Ledger, dict[str, Claim | None], list[Fault]]:
     """Return the ledger, with what is in effect for files of claims that are not valid."""
     put_back, faults = dict[str, Claim | None](), list[Fault]()
-    # the second version put no claim back, and named those that were not in effect
-    held_back = entry.trailers.get("Held-Back", ()) if entry else ()
     ledger = Ledger()
-    for path, text in _claim_texts(commit.tree, progress):
+    files = trees.blobs(commit.tree, (claim_files.LEDGER_ROOT,))
+    blobs = [(path, blob) for path, blob in files if claim_files.kind_of(path)]
+    for done, (path, blob) in enumerate(blobs):
+        if done % 200 == 0:
+            progress(done, len(blobs))
         try:
-            claim: Claim | None = claim_files.read(text, path)
-            if path in held_back:
-                raise InvalidInput([fault("", "no demand could have booked this").within(path)])
+            claim: Claim | None = claim_files.read(trees.text_of(blob), path)
         except InvalidInput as error:
             faults += error.faults
             put_back[path] = claim = ledger_files.as_last_written(repo, commit.id, path)
         if claim is not None:
             ledger = ledger.replace(claim.key, claim)
+    progress(len(blobs), len(blobs))
     ended = records.read_ended_override(end_markers_at(commit.tree))
     return replace(ledger, ended=ended, waiting=_waiting(commit.tree)), put_back, faults
-
-
-def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
-    # ``progress`` gets the numbers of read and of all claim files
-    blobs: list[tuple[str, Blob]] = [
-        (path, blob)
-        for path, blob in trees.blobs(tree, (claim_files.LEDGER_ROOT,))
-        if claim_files.kind_of(path)
-    ]
-    for done, (path, blob) in enumerate(blobs):
-        if done % 200 == 0:
-            progress(done, len(blobs))
-        yield path, trees.text_of(blob)
-    progress(len(blobs), len(blobs))
 
 
 def _waiting(tree: Tree) -> records.WaitingDemands:

@@ -30,7 +30,7 @@ from demandops.model.config.override import OVERRIDES_ROOT, format_time
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
-from demandops.model.ledger.ledger import Ledger, World, changes_on
+from demandops.model.ledger.ledger import Ledger, World, changes_on, ledger_of
 from demandops.render.gitops import BOOTSTRAP_ROOT, path_of
 from demandops.repo.git import tree as trees
 from demandops.repo.load import ledger_files
@@ -91,8 +91,7 @@ def check(
     except InvalidInput as error:  # of what is no plain file
         return CheckResult(error.faults)
     edit = _Edit(files, start, now or REAL.now())
-    claims = ledger_files.read_claims(sorted(files.items()))
-    faults = list(claims.faults)
+    claims, faults = ledger_files.read_claims(sorted(files.items()))
     edited = [path for path in edit.changed if _is_written_by_generator(path)]
     result = CheckResult(
         (),
@@ -104,7 +103,7 @@ def check(
     try:
         config = edit.config()
         faults += edit.unversioned_charts(config)
-        state = edit.merged_state(config, claims.ledger())
+        state = edit.merged_state(config, ledger_of(claims))
         faults += edit.refused_claims(state)
         wanted = edit.rendered(state)
     except InvalidInput as error:
@@ -291,13 +290,10 @@ class _Edit:
             if was != theirs and self.files.get(path) == was:
                 merged.pop(path, None)
                 merged |= {path: theirs} if theirs is not None else {}
-        whole, claims = (
-            replace(self, files=merged),
-            ledger_files.read_claims(sorted(merged.items())),
-        )
-        faults = list(claims.faults)
+        whole = replace(self, files=merged)
+        claims, faults = ledger_files.read_claims(sorted(merged.items()))
         try:
-            whole.rendered(whole.merged_state(whole.config(), claims.ledger()))
+            whole.rendered(whole.merged_state(whole.config(), ledger_of(claims)))
         except InvalidInput as error:
             faults += error.faults
         for each in faults:
