@@ -129,9 +129,7 @@ def load(
 
 
 def ledger_at(
-    repo: Repository,
-    commit: Commit,
-    progress: Progress = lambda done, total: None,
+    repo: Repository, commit: Commit, progress: Progress = lambda done, total: None
 ) -> tuple[Ledger, dict[str, Claim | None], list[Fault]]:
     """Return the ledger, with what is in effect for files of claims that are not valid."""
     put_back, faults = dict[str, Claim | None](), list[Fault]()
@@ -523,11 +521,7 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
         **carried.files,
     }
     snapshot = replace(
-        wanted,
-        state=state,
-        put_back=put_back,
-        claim_faults=tuple(faults),
-        is_rendered=True,
+        wanted, state=state, put_back=put_back, claim_faults=tuple(faults), is_rendered=True
     )
     named = (*keys, *(claim.key for claim in put_back.values() if claim))
     return Followed(snapshot, before, replace(carried, files=files), named)
