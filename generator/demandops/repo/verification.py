@@ -142,6 +142,10 @@ class Verdict:
     signature: str = ""
 
 
+class _Unreadable(Exception):
+    """Raised when a commit cannot be verified because one of its files is not valid."""
+
+
 class _Proof:
     # the files that a commit should have, rendered again to compare with its committed files
     def __init__(self, state: State, commit: Commit, source: Tree) -> None:
@@ -264,10 +268,6 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         else:
             holds = verdict.holds and not (differing or verdict.touched)
             yield replace(verdict, holds=holds, differing=differing)
-
-
-class _Unreadable(Exception):
-    """Raised when a commit cannot be verified because one of its files is not valid."""
 
 
 def _loaded(repo: Repository, commit: Commit, entry: LogEntry) -> State:

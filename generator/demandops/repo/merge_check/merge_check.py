@@ -9,6 +9,7 @@ shows how the merge would change desired state and bookkeeping.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import chain, count
@@ -130,11 +131,17 @@ def check(
         # a topic that was lacking before is not of this edit
         old = missing_inputs(start.state) if start and start.state else ()
         lacking = {(topic.application, topic.reason) for topic in old}
+        booked: tuple[EntryChange, ...] | None = ()
+        if start is not None:
+            booked = None
+            with suppress(InvalidInput):  # the base's bookkeeping may not be known
+                if start.state is not None:
+                    booked = bookkeeping_changes(bookkeeping(start.state), bookkeeping(state))
         result = replace(
             result,
             preview=preview,
             charts=charts,
-            bookkeeping=_bookkeeping_changes(start, state),
+            bookkeeping=booked,
             warnings=(
                 *(fault("", text).within(path) for path, text in idle),
                 *warnings.ignored_field_warnings(state.config),
@@ -391,15 +398,3 @@ class _Edit:
                     f"at charts.{name} in {config.file_of(CHARTS_FILE, name)}, or no cluster "
                     "applies the change",
                 ).within(metadata)
-
-
-def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
-    if start is None:
-        return ()
-    if start.state is None:
-        return None
-    try:
-        old = bookkeeping(start.state)
-    except InvalidInput:
-        return None
-    return bookkeeping_changes(old, bookkeeping(state))
