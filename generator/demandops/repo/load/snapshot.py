@@ -120,7 +120,7 @@ def load(
     commit = trees.commit_of(repo, revision)
     tree, configuration = commit.tree, configuration_of(repo, commit, entry)
     config = config_at(trees.commit_of(repo, configuration).tree)
-    ledger, put_back, faults = ledger_at(repo, commit, progress)
+    ledger, put_back, faults = ledger_at(repo, commit, progress, entry)
     told = None if configuration == commit.id else config_ids(tree)
     state = State(config, ledger, EVALUATE)
     return Snapshot(
@@ -129,10 +129,15 @@ def load(
 
 
 def ledger_at(
-    repo: Repository, commit: Commit, progress: Progress = lambda done, total: None
+    repo: Repository,
+    commit: Commit,
+    progress: Progress = lambda done, total: None,
+    entry: LogEntry | None = None,
 ) -> tuple[Ledger, dict[str, Claim | None], list[Fault]]:
     """Return the ledger, with what is in effect for files of claims that are not valid."""
     put_back, faults = dict[str, Claim | None](), list[Fault]()
+    # the second version put no claim back, and named those that were not in effect
+    held_back = entry.trailers.get("Held-Back", ()) if entry else ()
     ledger = Ledger()
     files = trees.blobs(commit.tree, (claim_files.LEDGER_ROOT,))
     blobs = [(path, blob) for path, blob in files if claim_files.kind_of(path)]
@@ -141,6 +146,8 @@ def ledger_at(
             progress(done, len(blobs))
         try:
             claim: Claim | None = claim_files.read(trees.text_of(blob), path)
+            if path in held_back:
+                raise InvalidInput([fault("", "no demand could have booked this").within(path)])
         except InvalidInput as error:
             faults += error.faults
             put_back[path] = claim = ledger_files.as_last_written(repo, commit.id, path)
