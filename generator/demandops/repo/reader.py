@@ -22,8 +22,14 @@ from demandops.model.config.config import Config
 from demandops.model.demand.demand import Rollback
 from demandops.repo import verification
 from demandops.repo.git import tree as trees
-from demandops.repo.git.local_repository import LastFetch, connect, is_url, needs_push
-from demandops.repo.git.repository import StateRepository, access_error, reading
+from demandops.repo.git.remote_repository import connect, is_url
+from demandops.repo.git.repository import (
+    LastFetch,
+    StateRepository,
+    access_error,
+    needs_push,
+    reading,
+)
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
 from demandops.repo.history.commit_message import PROPOSAL
@@ -196,7 +202,7 @@ class Reader:
         for verdict in verification.verify(self._objects, commits, whole=whole):
             verdicts.append(verdict)
             progress(len(verdicts), len(commits))
-        return verification.with_signatures(self._objects, verdicts)
+        return verdicts
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
         history = commit_log.history_of(self._objects, revision, path, most)

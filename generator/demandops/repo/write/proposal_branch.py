@@ -147,9 +147,10 @@ class ProposalBranches:
 
         The proposal is ``commit``, made on ``base``. The demands would now change ``files``.
         """
-        if (compared := self._trees(tip, commit, base, files)) is None:
+        try:
+            old, proposal, now, new = self._trees(tip, commit, base, files)
+        except StateRepoError:
             return False
-        old, proposal, now, new = compared
         proposed = dict(trees.differences(old, proposal))
         if proposed != dict(trees.differences(now, new)):
             return False
@@ -159,22 +160,20 @@ class ProposalBranches:
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> bool:
         # leases aside; also true if the proposal is unknown
-        if (compared := self._trees(tip, commit, base, files)) is None:
+        try:
+            old, proposal, now, new = self._trees(tip, commit, base, files)
+        except StateRepoError:
             return True
-        old, proposal, now, new = compared
         paths = {*ledger_files.changed_files(old, proposal), *ledger_files.changed_files(now, new)}
         pairs = (map(ledger_files.valid_claim_at, (proposal, new), (path,) * 2) for path in paths)
         return all((a and a.booked) == (b and b.booked) for a, b in pairs)
 
     def _trees(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
-    ) -> tuple[Tree, Tree, Tree, Tree] | None:
+    ) -> tuple[Tree, Tree, Tree, Tree]:
+        # StateRepoError is raised if the clone was made again, or `git gc` removed the commit
         objects = self._repository.objects
-        try:
-            old, proposal = commit_of(objects, base).tree, commit_of(objects, commit).tree
-        except StateRepoError:
-            return None  # the clone was made again, or `git gc` removed the commit
-        now = commit_of(objects, tip).tree
+        old, proposal, now = (commit_of(objects, each).tree for each in (base, commit, tip))
         return old, proposal, now, objects[self._repository.new.add_tree(now, files)].peel(Tree)
 
 
