@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from demandops.base.naming import Subject, SubjectKind
+from demandops.base.quantities import amount_text
 from demandops.decide.placement.capacity import whole_usage
 from demandops.decide.planning.overrides import suspended_claims, without_suspended
 from demandops.decide.planning.planner import connection_topics, demanded_inputs
-from demandops.model.config.inventory import amount_text
 from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import in_turn
