@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 
 from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
+from demandops.views.source import RANKS, WORDS, Source, word_of
 from demandops.web.lists import Filter, Row, rows_of
-from demandops.web.situation import RANKS, WORDS, Situation, word_of
 
 # ---- the layout: nodes are drawn at their positions, or by cluster and type ----
 
@@ -177,15 +177,15 @@ class Line:
     title: str
 
 
-def picture(now: Situation, wanted: Filter, layout: str) -> dict[str, Any]:
+def picture(now: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     # A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a
     # position. If no drawn node has a position, nodes are drawn by cluster.
-    config = now.commit_state.config
+    config = now.config
     nodes = list(config.nodes.values())
     rows = rows_of(now, "services") if wanted else []
     lit_services = {row.cells["release"].parts[0].text for row in rows if wanted.matches(row)}
     marks: dict[str, list[ServiceMark]] = {id: [] for id in config.nodes}
-    for release, _ in now.commit_state.targets:
+    for release, _ in now.targets:
         if isinstance(release, ServiceRelease) and release.node.id in marks:
             tone = WORDS[word_of(now.status(release.name))]
             source = release.key.source
@@ -281,7 +281,7 @@ def _short(text: str, most: int) -> str:
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
-def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> list[Line]:
+def _lines(now: Source, wanted: Filter, cards: Mapping[str, NodeCard]) -> list[Line]:
     # lit lines come last, on top
     pairs: dict[tuple[str, str], list[Row]] = {}
     for row in rows_of(now, "connections"):

@@ -19,7 +19,6 @@ from demandops.web import fleet_map, server
 from demandops.web.follower import Follower
 from demandops.web.lists import LISTS, Filter, rows_of
 from demandops.web.server import Site
-from demandops.web.situation import CommitState
 from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import DENY, VIEWS, Look, causes
@@ -55,12 +54,12 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     overridden(booked)
     page = look("/")
     assert page.texts("h1") == ["1 of 1 application is not ready"]
-    (cause,) = causes(follower.newest, follower)
+    (cause,) = causes(follower.newest)
     assert (cause.kind, cause.told) == ("suspended", "The road is closed")
     assert cause.who == "traffic-control, who owns the override"
     assert cause.command == "git rm overrides/roadworks.yaml"
     assert cause.requesters == ("station00", "vehicle01")
-    changed = follower.last_change(follower.newest.commit_state, "overrides/roadworks.yaml")
+    changed = follower.newest.last_change("overrides/roadworks.yaml")
     assert changed and cause.since == changed.time
     assert "vehicle01/edge is booked, but overrides/roadworks.yaml denies it" in page.text
     assert "vehicle01/edge" not in look("/connections").text
@@ -86,7 +85,7 @@ def test_an_invalid_file_names_who_wrote_it(
     person.change({"registry/images.yaml": "images: [\n"}, "Break it")
     broken(booked)
     page = look("/")
-    (cause,) = causes(follower.newest, follower)
+    (cause,) = causes(follower.newest)
     assert cause.kind == "invalid"
     assert cause.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
     assert cause.command.startswith("git show ")
@@ -211,7 +210,7 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
         node["position"] = {"x": 10.0 * (number % 3), "y": float(number)}
     person.change({path: yaml.safe_dump(nodes)})
     wait_until(
-        lambda: all(node.position for node in follower.newest.commit_state.config.nodes.values()),
+        lambda: all(node.position for node in follower.newest.config.nodes.values()),
         "the nodes have positions",
     )
     drawn = fleet_map.picture(follower.newest, Filter(""), "")
@@ -259,7 +258,7 @@ def test_views_derived_step_by_step_equal_views_derived_from_scratch(
     scaling = "{max: 4, per: {sources: 1}, dividesWork: true}"
     text = person.read(appdef).replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")
     person.change({appdef: text}, "Scale")
-    wait_until(lambda: follower.newest.commit_state.config.files[appdef] == text, "it is shown")
+    wait_until(lambda: follower.newest.config.files[appdef] == text, "it is shown")
     joins = [yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT]
     another = copy.deepcopy(joins[0]) | {"connections": []}
     another["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station01"]
@@ -272,10 +271,9 @@ def _assert_taken_over(follower: Follower, look: Look) -> None:
     for name in LISTS:
         look(f"/{name}")
     now = follower.newest
-    state = CommitState(now.commit_state.snapshot, now.commit_state.entry, ())
-    anew = replace(now, commit_state=state)
-    assert now.commit_state.targets == anew.commit_state.targets
-    assert now.commit_state.claims_of_releases == anew.commit_state.claims_of_releases
+    anew = replace(now, derived={})
+    assert now.targets == anew.targets
+    assert now.claims_of_releases == anew.claims_of_releases
     for name in LISTS:
         assert sorted(map(str, rows_of(now, name))) == sorted(map(str, rows_of(anew, name)))
 
