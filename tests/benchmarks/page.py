@@ -79,7 +79,7 @@ def main() -> None:
         generator = Generator(str(laid.path))
         follower = Follower(Reader.of(str(laid.path)), {}, 0)
         server = WebServer("127.0.0.1:0", "--listen", follower)
-        release = next(iter(follower.newest.commit_state.releases))
+        release = next(iter(follower.newest.releases))
         for view in (*VIEWS, f"release?name={release}"):
             name = view.partition("=")[0] or "not ready"
             rows.append({"view": name} | _row(browser, generator, server, view))

@@ -19,12 +19,12 @@ from typing import Any
 
 import pygit2
 import yaml
+from demandops.decide.bookkeeping import as_data, bookkeeping
 from demandops.decide.state import State
 from demandops.repo import new_repo, reader
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.history.commit_message import GENERATOR_EMAIL, GENERATOR_NAME
 from demandops.repo.load import snapshot as snapshots
-from demandops.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit import plain_yaml
 from tests.kit.memory import NOW

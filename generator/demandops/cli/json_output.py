@@ -17,6 +17,7 @@ from demandops.base.naming import Subject
 from demandops.base.quoting import json_escaped, lines
 from demandops.cli.output import painted, print_lines, terminal_width
 from demandops.cli.table import Table
+from demandops.decide.bookkeeping import versions_asked
 from demandops.model.config.base_model import plain
 from demandops.model.config.override import Override, format_time
 from demandops.model.config.registry import ImagePin
@@ -27,7 +28,6 @@ from demandops.model.ledger.ledger import Ledger
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import path_of
 from demandops.repo.history.commit_log import LogEntry
-from demandops.views.release_causes import versions_asked
 
 Json = dict[str, Any]
 Command = Callable[..., Any]

@@ -14,8 +14,8 @@ from typing import Any
 
 from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
+from demandops.views.source import RANKS, WORDS, Source, word_of
 from demandops.web.lists import Filter, Row, exactly, rows_of
-from demandops.web.situation import RANKS, WORDS, Situation, word_of
 
 # A drawing for wide screens and one for phones, of which the style sheet shows one: its width, and
 # above how many nodes of a type these are drawn as stacks.
@@ -124,10 +124,10 @@ class Drawing:
     is_cut: bool = False  # lines are left out
 
 
-def picture(now: Situation, wanted: Filter, layout: str) -> dict[str, Any]:
+def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     # A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a
     # position, and some are not in one row.
-    config = now.commit_state.config
+    config = source.config
     nodes = sorted(config.nodes.values(), key=lambda node: (node.cluster, node.id))
     layouts = ("cluster", "place") if any(node.position for node in nodes) else ("cluster",)
     if layout not in layouts:
@@ -135,27 +135,29 @@ def picture(now: Situation, wanted: Filter, layout: str) -> dict[str, Any]:
         layout = "place" if is_placed else "cluster"
 
     connections = [
-        row for row in rows_of(now, "connections") if config.nodes.keys() >= {*row.hidden["node"]}
+        row
+        for row in rows_of(source, "connections")
+        if config.nodes.keys() >= {*row.hidden["node"]}
     ]
     peers: dict[str, set[str]] = defaultdict(set)
     for row in connections:
-        source, target = row.hidden["node"]
-        peers[source].add(target)
-        peers[target].add(source)
+        one, other = row.hidden["node"]
+        peers[one].add(other)
+        peers[other].add(one)
 
     matching: list[Row] = []
     if wanted:
-        matching = [*filter(wanted.matches, (*rows_of(now, "services"), *connections))]
+        matching = [*filter(wanted.matches, (*rows_of(source, "services"), *connections))]
     lit_releases = {part.text for row in matching for part in row.cells["release"].parts}
     marks: dict[str, list[Mark]] = {id: [] for id in config.nodes}
-    for release, _ in now.commit_state.targets:
+    for release, _ in source.targets:
         if release.node.id in marks:
             is_service = isinstance(release, ServiceRelease)
             if isinstance(release, ServiceRelease):
                 text = " · ".join(filter(None, (release.key.service, release.key.source)))
             else:
                 text = f"{release.type.word} {', '.join(release.connections)}"
-            tone = WORDS[word_of(now.status(release.name))]
+            tone = WORDS[word_of(source.status(release.name))]
             mark = Mark(text, tone, is_service, release.name in lit_releases)
             marks[release.node.id].append(mark)
 
@@ -345,8 +347,9 @@ def _draw_lines(
     between: dict[tuple[int, int], list[Row]] = {}
     ends: dict[tuple[int, int], tuple[Card, Card]] = {}
     for row in connections:
-        source, target = row.hidden["node"]
-        pair = sorted((card_of[source], card_of[target]), key=lambda card: (card.row, card.x))
+        pair = sorted(
+            map(card_of.__getitem__, row.hidden["node"]), key=lambda card: (card.row, card.x)
+        )
         if pair[0] is not pair[1]:
             key = id(pair[0]), id(pair[1])
             ends[key] = pair[0], pair[1]

@@ -6,9 +6,7 @@ import logging
 import shlex
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
-from dataclasses import replace
 from datetime import timezone
-from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -34,12 +32,11 @@ from demandops.base.quoting import escaped, lines
 from demandops.model.config.base_model import relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
-from demandops.views.release_causes import override_state
+from demandops.views.source import WORDS, Source
 from demandops.web import fleet_map, lists, not_ready, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Part, Row, rows_of
 from demandops.web.release_view import explained_demand, explained_release
-from demandops.web.situation import WORDS, Situation
 
 # ---- the views, by address ----
 
@@ -67,7 +64,7 @@ class ViewRequest:
         self.follower = follower
         self.path = request.url.path.strip("/")
         self.params = dict(request.query_params)
-        self.situation: Situation = follower.at(self.get("at"))
+        self.source: Source = follower.at(self.get("at"))
         self.filter = Filter(self.get("q"))
 
     def get(self, name: str) -> str:
@@ -93,11 +90,8 @@ class ViewRequest:
 
 
 def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
-    commit_state = asked.situation.commit_state
-    last_change = partial(asked.follower.last_change, commit_state)
-    pending = asked.follower.not_rendered(commit_state)
-    causes = not_ready.causes(asked.situation, asked.filter, last_change, pending)
-    applications = not_ready.applications(asked.situation, causes, asked.filter)
+    causes = not_ready.causes(asked.source, asked.filter)
+    applications = not_ready.applications(asked.source, causes, asked.filter)
     return "not_ready.html.j2", {
         "causes": causes[:_MOST_CAUSES],
         "total": len(causes),
@@ -108,7 +102,7 @@ def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
 
 def _list(asked: ViewRequest) -> tuple[str, Data]:
     kind, sort = LISTS[asked.path], asked.get("sort")  # `-` before a key is the reverse order
-    rows = rows_of(asked.situation, asked.path)
+    rows = rows_of(asked.source, asked.path)
     matching = [row for row in rows if asked.filter.matches(row)]
     if (key := sort.removeprefix("-")) not in kind.columns:
         sort = key = next(iter(kind.columns))
@@ -126,17 +120,17 @@ def _list(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _timeline(asked: ViewRequest) -> tuple[str, Data]:
-    now, lane = asked.situation, asked.get("lane")
+    now, lane = asked.source, asked.get("lane")
     lanes = {lane} if lane in time_line.LANES else time_line.LANES
     events = [
         event
         for event in time_line.events(asked.follower.history, asked.follower.health_changes)
         if event.lane in lanes and (not asked.filter or asked.filter.matches(event.row()))
     ]
-    chosen = None if now.is_newest else (now.commit_state.entry.time, now.commit_state.commit)
+    chosen = None if now.is_newest else (now.entry.time, now.commit)
     changed: list[str] = []
     if asked.get("at"):
-        changed = asked.follower.reader().files_changed_by(now.commit_state.commit)
+        changed = asked.follower.reader().files_changed_by(now.commit)
     shown, page, pages = lists.page_of(events, asked.page(), size=50)
     return "timeline.html.j2", {
         "strip": time_line.strip(events, now.now, asked.get("span"), chosen),
@@ -153,10 +147,8 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _overrides(asked: ViewRequest) -> tuple[str, Data]:
-    now, entries = asked.situation, []
-    pending = asked.follower.not_rendered(now.commit_state)
-    for entry in now.commit_state.override_entries(now.now):
-        state = override_state(entry, now.commit_state.state, pending)
+    entries = []
+    for entry in asked.source.overrides:
         texts = {
             "owner": [entry.override.owner],
             "reason": [entry.override.reason],
@@ -165,7 +157,7 @@ def _overrides(asked: ViewRequest) -> tuple[str, Data]:
             "requester": [who for claim in entry.claims for who in claim.requesters],
         }
         if asked.filter.matches(Row({"override": lists.cell(entry.override.name)}, texts)):
-            entries.append(replace(entry, state=state))
+            entries.append(entry)
     return "overrides.html.j2", {"entries": entries}
 
 
@@ -177,7 +169,7 @@ def _rates(asked: ViewRequest) -> tuple[str, Data]:
         for commit in asked.follower.history
         if asked.filter.matches(time_line.of_commit(commit).row())
     ]
-    plots = time_line.plots(commits, health, asked.situation.now, span)
+    plots = time_line.plots(commits, health, asked.source.now, span)
     size = {"width": time_line.WIDTH, "height": time_line.HEIGHT}
     return "rates.html.j2", {"plots": plots, "span": span, "spans": time_line.SPANS, **size}
 
@@ -186,16 +178,16 @@ VIEWS: Mapping[str, View] = {
     "/": _not_ready,
     "/map": lambda asked: (
         "map.html.j2",
-        {"map": fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))},
+        {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
     ),
     **{f"/{name}": _list for name in LISTS},
     "/demand": lambda asked: (
         "demand.html.j2",
-        {"demand": explained_demand(asked.situation, asked.follower.reader(), asked.get("id"))},
+        {"demand": explained_demand(asked.source, asked.follower.reader(), asked.get("id"))},
     ),
     "/release": lambda asked: (
         "release.html.j2",
-        {"release": explained_release(asked.situation, asked.follower.reader(), asked.get("name"))},
+        {"release": explained_release(asked.source, asked.follower.reader(), asked.get("name"))},
     ),
     "/timeline": _timeline,
     "/overrides": _overrides,
@@ -313,9 +305,8 @@ class Site:
                 common = {
                     "navigation": NAVIGATION,
                     "here": asked,
-                    "now": asked.situation.now,
-                    "situation": asked.situation,
-                    "commit_state": asked.situation.commit_state,
+                    "now": asked.source.now,
+                    "source": asked.source,
                     "exactly": lists.exactly,
                     "program": __version__,
                     "has_docs": self._has_docs,

@@ -13,8 +13,8 @@ from typing import Any
 from demandops.model.config.base_model import span
 from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.repo.history.commit_message import PROPOSAL
+from demandops.views.source import WORDS, Commit, HealthChange
 from demandops.web.lists import Row, cell
-from demandops.web.situation import WORDS, Commit, HealthChange
 
 # ---- the time line of events ----
 

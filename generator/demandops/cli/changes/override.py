@@ -25,6 +25,7 @@ from demandops.cli.changes.person_change import writable
 from demandops.cli.json_output import Json
 from demandops.cli.output import done, errors, progress
 from demandops.cli.target import names_of
+from demandops.decide.override_report import override_report
 from demandops.model.config.base_model import parse_file, parse_time, seconds_of
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
@@ -34,7 +35,6 @@ from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails, Published
 from demandops.serve.approvals.proposal import merge_request
-from demandops.views.release_causes import override_report
 
 # ---- what the commands share: their options and selection ----
 

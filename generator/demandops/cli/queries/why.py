@@ -17,6 +17,7 @@ from demandops.cli.output import at_option, busy
 from demandops.cli.queries.diff import loaded
 from demandops.cli.queries.get import effect_words
 from demandops.cli.target import names_of, state_repo_option
+from demandops.decide.override_report import affected_releases, override_report
 from demandops.decide.planning.overrides import suspended_by, without_suspended
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.base_model import duration_text
@@ -33,7 +34,6 @@ from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.views import release_causes
 from demandops.views.demand_lists import nodes_of
-from demandops.views.release_causes import affected_releases, override_report
 
 # ---- the object that has the given name ----
 

@@ -19,7 +19,8 @@ from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.runtime import REAL
 from demandops.base.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.base.strict_yaml import with_lines
-from demandops.decide import changeset, warnings
+from demandops.decide import changeset, override_report, warnings
+from demandops.decide.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 from demandops.decide.changeset import MergePreview
 from demandops.decide.edits import expired_overrides, faults_of_edit, update_ledger
 from demandops.decide.state import State, rendered_files, try_configuration
@@ -39,8 +40,6 @@ from demandops.repo.merge_check.edited_checkout import Base, author_of, base_of
 from demandops.repo.merge_check.rendered_charts import RenderedCharts
 from demandops.templating import charts
 from demandops.templating.evaluator import EVALUATE
-from demandops.views import release_causes
-from demandops.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 
 _MOST_LEFT = 5
 
@@ -127,7 +126,7 @@ def check(
         faults += rendered_charts.manifest_faults(written)
         if require_helm and rendered_charts.MISSING in charts.not_rendered.values():
             faults.append(fault("", rendered_charts.NO_HELM))
-        idle = release_causes.warnings(release_causes.override_report(state, edit.now))
+        idle = override_report.warnings(override_report.override_report(state, edit.now))
         # a topic that was lacking before is not of this edit
         old = missing_inputs(start.state) if start and start.state else ()
         lacking = {(topic.application, topic.reason) for topic in old}
