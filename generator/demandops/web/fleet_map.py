@@ -163,7 +163,7 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
 
     spots = _spots(nodes)
     # a node is lit if it matches, or a service or connection that it has
-    chosen, lit = set[str](), {id for row in matching for id in row.texts["node"]}
+    chosen, lit = set[str](), {id for row in matching for id in _nodes_of(row)}
     for node in nodes if wanted else ():
         texts = {"node": [node.id], "type": [node.type], "cluster": [node.cluster]}
         texts |= {"peer": sorted(peers[node.id]) or ["none"]}
@@ -194,6 +194,10 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
         "layouts": layouts,
         "is_dimmed": bool(wanted),
     }
+
+
+def _nodes_of(row: Row) -> Iterable[str]:
+    return row.hidden.get("node") or [part.text for part in row.cells["node"].parts]
 
 
 # ---- which nodes stand together ----
