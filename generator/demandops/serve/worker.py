@@ -456,11 +456,12 @@ class Worker:
             reason = disk_error(error, self._repository.address)
             if reason is not None:  # the state repo fails, so no demand can be evaluated
                 raise reason from None
-            if (
-                getattr(error, "errno", None) is None
-            ):  # a file that only this demand reads may be damaged
+            # a file that only this demand reads may be damaged
+            if getattr(error, "errno", None) is None:
                 told = access_error(error, self._repository.address, self._repository.objects)
                 if isinstance(told, StateRepoError):
+                    if self._repository.renew_if_damaged():
+                        raise Unavailable(f"{told}; its clone was damaged and is made anew")
                     return told
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return internal(error)
