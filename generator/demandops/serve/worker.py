@@ -462,7 +462,7 @@ class Worker:
                 told = access_error(error, self._repository.address, self._repository.objects)
                 if isinstance(told, StateRepoError):
                     if self._repository.renew_if_damaged():
-                        raise Unavailable(f"{told}; its clone was damaged and is made anew")
+                        raise Unavailable(f"{told}; the clone is made anew") from None
                     return told
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return internal(error)
