@@ -228,9 +228,9 @@ def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
 
 
 def test_the_node_in_several_domains_of_the_documentation() -> None:
-    (policy,) = (text for text in blocks("policy.md") if "name: guests" in text)
+    policy = (DOCS.parent / "examples" / "policy" / "node-in-two-domains.yaml").read_text()
     edge = data("policy.md", "nodes:\n  - id: edge")["nodes"]
-    repo = MemoryRepo(with_nodes(edge) | {POLICY: _DOMAINS + policy})
+    repo = MemoryRepo(with_nodes(edge) | {POLICY: policy})
 
     def folders(who: str, node: str = "edge") -> set[str]:
         releases = repo.decide(put(who, who, node=node, connect="none")).releases
