@@ -145,30 +145,24 @@ def _there(source: Source, name: str) -> Iterator[tuple[str, str]]:
     for subject in (Subject(kind, name) for kind in SubjectKind):
         if ledger.claims_on(subject):
             yield subject.kind.value[:-1], claim_files.folder_of(subject)
-    if name in _demands(source):
-        yield "demand", ""
-    names = {who for waiting in ledger.waiting.values() for who in waiting.requesters}
-    names |= {who for proposal in source.proposals for who in proposal.requesters}
-    if name in names or ("requester", name) in ledger.index:
-        yield "requester", ""
-    if node := config.nodes.get(name):
-        domain = config.domain_of.get(name)
-        folder = f"{domain_folder(node.cluster, domain)}/" if domain else ""
-        yield "node", f"{folder}{object_name('', name)}" if folder else ""
-    if name in config.overrides:
-        yield "override", config.overrides[name].path
-    elif any(proposal.branch == f"override/{name}" for proposal in source.proposals):
-        yield "override", ""
-    if any(proposal.branch == name for proposal in source.proposals):
-        yield "proposal", ""
-    if name in config.appdefs:
-        yield "appdef", f"appdefs/{name}/appdef.yaml"
-    if name in config.domains:
-        yield "domain", config.file_of(DOMAINS_FILE, name)
-    for appdef, services in config.services.items():
-        if name in services:
-            yield "service", f"appdefs/{appdef}/appdef.yaml"
-            break
+    requesters = {who for waiting in ledger.waiting.values() for who in waiting.requesters}
+    requesters |= {who for proposal in source.proposals for who in proposal.requesters}
+    proposed = {proposal.branch for proposal in source.proposals}
+    node, domain = config.nodes.get(name), config.domain_of.get(name)
+    of_services = {each: appdef for appdef, own in config.services.items() for each in own}
+    override = config.overrides[name].path if name in config.overrides else None
+    folder = f"{domain_folder(node.cluster, domain)}/" if node and domain else ""
+    paths = {
+        "demand": "" if name in _demands(source) else None,
+        "requester": "" if name in requesters or ("requester", name) in ledger.index else None,
+        "node": (folder and folder + object_name("", name)) if node else None,
+        "override": "" if f"override/{name}" in proposed and not override else override,
+        "proposal": "" if name in proposed else None,
+        "appdef": f"appdefs/{name}/appdef.yaml" if name in config.appdefs else None,
+        "domain": config.file_of(DOMAINS_FILE, name) if name in config.domains else None,
+        "service": f"appdefs/{of_services[name]}/appdef.yaml" if name in of_services else None,
+    }
+    yield from ((kind, path) for kind, path in paths.items() if path is not None)
 
 
 def _gone(source: Source, reader: Reader, name: str) -> Iterator[tuple[str, str]]:
