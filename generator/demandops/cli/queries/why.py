@@ -176,7 +176,8 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
 @click.option(
     "--kind",
     type=click.Choice(KINDS),
-    help="The kind of the object, if several objects have the name.",
+    metavar="KIND",
+    help=f"The kind of the thing, if several have the name: {', '.join(KINDS)}.",
 )
 @click.option(
     "-n",
@@ -191,14 +192,13 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:
-    """Explain why something runs or ran.
+    """Explain why something runs or ran, who decided it, and what it held.
 
-    The command shows the requesters, the configuration and overrides that apply, and the commits.
-    NAME is the name of a release, application definition or override, or the id of an application,
-    connection, demand, node or requester. A part of a release's name or the start of a demand's id
-    is enough if no other release or demand has it. PATH is a file in a folder of the state repo,
-    such as clusters/ or ledger/. If something no longer runs, the command shows the commit that
-    stopped it.
+    The command shows the requesters, the configuration and overrides that apply, open proposals,
+    who approved or rejected, and the commits. NAME is the name of a thing of any kind that --kind
+    lists. A part of a release's name or the start of a demand's id is enough if no other release or
+    demand has it. PATH is a file in a folder of the state repo, such as clusters/ or ledger/. If
+    something is gone, the command shows since when, who ended it, and what it held.
 
     \b
     Examples:
