@@ -49,6 +49,10 @@ COMMANDS = {
         "demandops_ros.parameter_sync",
         "Keep a ROS node's parameters equal to those in a ConfigMap.",
     ),
+    "release": (
+        "changes.ledger_change",
+        "Stop one demand, or an application for all who demand it.",
+    ),
     "reject": ("changes.approve", "Turn a proposed demand down: delete its branch."),
     "request": ("changes.request", "Book demand requests from files."),
     "resume": ("changes.override", "Run suspended applications and connections again."),

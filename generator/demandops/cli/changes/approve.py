@@ -96,7 +96,7 @@ def approve(
       demandops approve visit -m "Agreed with the control room"
       demandops approve visit --commit 5d41402abc4b2a76b9719d911017c592e81f9d3a
     """
-    if not (commit or person_change.is_asked(yes, output)):
+    if not (commit or person_change.is_asked(yes)):
         raise click.UsageError(
             "name the commit that you looked at: --commit ID; `demandops get proposals` lists it"
         )
@@ -113,7 +113,7 @@ def approve(
                 *(f"~ file {path}" for path in by_hand),
             ):
                 errors.print(f"  {one_line(line)}")
-        person_change.confirm("Approve it?", yes, output)
+        person_change.confirm("Approve it?", yes or bool(commit))
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
         details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
         merged = person_commit.merge(repo.repository, proposal, details)
@@ -144,7 +144,7 @@ def reject(name: str, commit: str, yes: bool, state_repo: str, output: str) -> N
     """
     with person_change.writable(state_repo, None) as repo:
         proposal = _proposal(repo, name, commit, output)
-        person_change.confirm("Turn it down?", yes, output)
+        person_change.confirm("Turn it down?", yes or bool(commit))
         ProposalBranches(repo.repository).remove(proposal.branch, proposal.commit)
         done.append(f"{proposal.branch} is deleted")
     data = {"outcome": "rejected", "branch": proposal.branch, "commit": proposal.commit}
