@@ -17,10 +17,10 @@ from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
 from demandops.cluster.health import Health, Level
 from demandops.cluster.rollouts import RolloutWatcher
+from demandops.decide.bookkeeping import as_data, bookkeeping
 from demandops.repo.load.snapshot import Snapshot
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Receipt, Ticket
-from demandops.views.bookkeeping import as_data, bookkeeping
 from demandops_interfaces.msg import Bookkeeping as BookkeepingMessage
 from demandops_interfaces.srv import GetBookkeeping
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue

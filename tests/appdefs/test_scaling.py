@@ -9,10 +9,10 @@ from typing import Any, Literal
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops.decide.changeset import render_trial_demands
+from demandops.decide.override_report import override_report, warnings
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import rendered_files
 from demandops.model.release import ServiceKey
-from demandops.views.release_causes import override_report, warnings
 
 from tests.appdefs.test_recorder import ADDITIONS
 from tests.kit import plain_yaml

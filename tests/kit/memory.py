@@ -14,6 +14,7 @@ import jsonschema_rs
 import yaml
 from demandops.base.errors import Refused
 from demandops.base.settings import data_folder
+from demandops.decide.bookkeeping import as_data, bookkeeping
 from demandops.decide.decision import Decision, decide
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import Config
@@ -23,7 +24,6 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
-from demandops.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, skeleton, state_of

@@ -68,7 +68,7 @@ class Story:
 
     def wait_followed(self) -> None:
         def is_at() -> bool:
-            return self.follower.newest.commit_state.commit == str(self.generator.snapshot.commit)
+            return self.follower.newest.commit == str(self.generator.snapshot.commit)
 
         wait_until(is_at, "the page has the newest commit")
 
@@ -77,7 +77,7 @@ class Story:
         commit = str(self.generator.snapshot.commit)
         since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")
         self.api.flux(NAMESPACE, "perception", commit)
-        for release, target in self.follower.at(commit).commit_state.targets:
+        for release, target in self.follower.at(commit).targets:
             if target.is_service:
                 fault = FAULT if release.name == FAILING and not mended else ""
                 self.api.helm_release(NAMESPACE, release.name, fault, since)

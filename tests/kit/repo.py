@@ -19,12 +19,12 @@ from typing import Any
 
 import pygit2
 import yaml
+from demandops.decide.bookkeeping import as_data, bookkeeping
 from demandops.decide.state import State
 from demandops.repo import new_repo, reader
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.history.commit_message import GENERATOR_EMAIL, GENERATOR_NAME
 from demandops.repo.load import snapshot as snapshots
-from demandops.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit import plain_yaml
 from tests.kit.memory import NOW
@@ -295,8 +295,9 @@ def operations(repo: Path) -> list[str]:
     return [found for commit in commits(repo) if (found := commit.one("Operation-Id"))]
 
 
-def branches(repo: Path) -> list[str]:
-    return sorted(b for b in pygit2.Repository(str(repo)).branches.local if b.startswith("demand/"))
+def branches(repo: Path, *folders: str) -> list[str]:
+    names = pygit2.Repository(str(repo)).branches.local
+    return sorted(name for name in names if name.startswith(folders or "demand/"))
 
 
 def state_of(repo: Path, revision: str = "main") -> State:

@@ -1,1 +1,1 @@
-"""What people see of a state, as rows and values. Pure."""
+"""What people see of a state, as rows and values."""

@@ -18,11 +18,10 @@ from demandops.cluster.health import ClusterDomain, health_reader
 from demandops.cluster.object_cache import object_caches
 from demandops.cluster.release_status import old_bootstraps, orphans, statuses
 from demandops.repo.git.repository import reading
-from demandops.repo.history.commit_log import LogEntry
-from demandops.repo.load.snapshot import Progress, Snapshot
+from demandops.repo.load.snapshot import Progress
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
-from demandops.web.situation import Commit, CommitState, HealthChange, Situation, word_of
+from demandops.views.source import Commit, HealthChange, Source, word_of
 
 # ---- the releases on their clusters, and the changes of their health ----
 
@@ -38,8 +37,7 @@ class ClusterWatch:
         self._caches = object_caches(clusters, on_change, REAL)
         self.clusters = frozenset(self._caches)
         self._domains = set[ClusterDomain]()
-        # The word for the health of each release, and since when it is not healthy.
-        self._seen: dict[str, tuple[str, float | None]] = {}
+        self._seen: dict[str, str] = {}  # the word for the health of each release
         self._changes = deque[HealthChange](maxlen=_KEPT)
 
     @property
@@ -47,37 +45,28 @@ class ClusterWatch:
         # any thread may read this; to iterate would fail if the follower appended meanwhile
         return tuple(self._changes.copy())
 
-    def with_reports(self, situation: Situation, reader: Reader) -> Situation:
-        commit_state, caches, repository = situation.commit_state, self._caches, reader.repository
-        targets = [target for _, target in commit_state.targets]
-        domains = rollouts.domains_of_state(commit_state.state)
+    def with_reports(self, source: Source, reader: Reader) -> Source:
+        caches, repository = self._caches, reader.repository
+        targets = [target for _, target in source.targets]
+        domains = rollouts.domains_of_state(source.state)
         for domain in dict.fromkeys((*(target.domain for target in targets), *domains)):
             if domain.cluster in caches and domain not in self._domains:
                 self._domains.add(domain)
                 caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
-        commit = commit_state.commit
+        commit = source.commit
         # Health is judged by the file that the cluster has applied. Judged by the newest commit,
         # everything would be `waiting` for seconds after each commit.
         reported = statuses(targets, commit, caches, repository, repository.changed_paths)
         status_of = {target.name: status for target, status in zip(targets, reported, strict=True)}
-        at = REAL.monotonic()
         for name, status in status_of.items():
-            (before, began), after = self._seen.get(name, ("", None)), word_of(status)
-            if before == after:
-                continue
-            lasted = None
-            if after == "healthy":
-                lasted, began = None if began is None else at - began, None
-            elif after != "unknown" and began is None:
-                began = at
-            self._seen[name] = after, began
-            if before:  # the first health that a cluster reports of a release is no change
+            before, after = self._seen.get(name, ""), word_of(status)
+            self._seen[name] = after
+            if before and before != after:  # the first health that a cluster reports is no change
                 reason = status.health.reason
-                change = HealthChange(REAL.now(), name, before, after, reason, lasted)
-                self._changes.append(change)
+                self._changes.append(HealthChange(REAL.now(), name, before, after, reason))
         self._seen = {name: self._seen[name] for name in status_of}
         return replace(
-            situation,
+            source,
             statuses=status_of,
             old_bootstraps=tuple(old_bootstraps(domains, caches, reader.file_reader(commit))),
             orphans=tuple(orphans(domains, targets, commit, caches, repository)),
@@ -95,7 +84,7 @@ class ClusterWatch:
 
 log = logging.getLogger("demandops")
 
-# How many of the newest commits the time line and the rates show.
+# How many of the newest commits the time line shows.
 MOST_COMMITS = 5_000
 
 # The pause in seconds between checks of a local repository, which cost little.
@@ -104,7 +93,7 @@ _LOOK_S = 0.2
 # at most one second.
 _PAUSE_FACTOR = 4
 # How many earlier states are kept for visitors who look back; each holds a whole ledger.
-_MOST_COMMIT_STATES = 8
+_MOST_EARLIER = 8
 
 
 class Follower:
@@ -124,18 +113,18 @@ class Follower:
         self._wake, self.closed = REAL.event(), REAL.event()
         self._push_denied = push_denied
         self._watch = ClusterWatch(clusters, self._wake.set)
-        self._commit_states: dict[str, CommitState] = {}
+        self._earlier: dict[str, Source] = {}
         self._loading = REAL.lock()
         # Browsers fetch the page again when this number changes.
         self.version = 0
         # The newest commits, at most `MOST_COMMITS`, newest first.
         self.history: tuple[Commit, ...] = ()
         snapshot = reader.snapshot(progress=progress)
-        self._newest = self._situation_at(_commit_state(reader, snapshot))
+        self._newest = self._with_reports(Source.read(reader, snapshot))
         self._thread = REAL.keep_running("page", self._run)
 
     @property
-    def newest(self) -> Situation:
+    def newest(self) -> Source:
         return replace(self._newest, now=REAL.now())
 
     @property
@@ -150,37 +139,23 @@ class Follower:
         repository = self._reader.repository
         return reading(repository.address, repository.objects)
 
-    def at(self, revision: str) -> Situation:
+    def at(self, revision: str) -> Source:
         newest = self.newest
         if not revision:
             return newest
         reader = self.reader()
         commit = reader.commit(revision)
-        if commit == newest.commit_state.commit:
+        if commit == newest.commit:
             return newest
         with self._loading:  # load only one commit at a time, because loading may take seconds
-            commit_state = self._commit_states.pop(commit, None) or _commit_state(
-                reader, reader.snapshot(commit)
+            source = self._earlier.pop(commit, None) or Source.read(
+                reader, reader.snapshot(commit), is_newest=False
             )
-            # added again at the end, so that the state that was not used for longest is dropped
-            self._commit_states[commit] = commit_state
-            if len(self._commit_states) > _MOST_COMMIT_STATES:
-                del self._commit_states[next(iter(self._commit_states))]
-        return Situation(commit_state, newest.now, is_newest=False)
-
-    def last_change(self, commit_state: CommitState, path: str) -> LogEntry | None:
-        if path not in commit_state.last_changes:
-            changes = self.reader().log(commit_state.commit, path) if path else iter(())
-            commit_state.last_changes[path] = next(changes, None)
-        return commit_state.last_changes[path]
-
-    def not_rendered(self, commit_state: CommitState) -> frozenset[str]:
-        if commit_state.not_rendered is None:
-            try:
-                commit_state.not_rendered = self.reader().not_rendered(commit_state.snapshot)
-            except DemandOpsError:
-                return frozenset()
-        return commit_state.not_rendered
+            # added again at the end, so that the source that was not used for longest is dropped
+            self._earlier[commit] = source
+            if len(self._earlier) > _MOST_EARLIER:
+                del self._earlier[next(iter(self._earlier))]
+        return replace(source, now=newest.now)
 
     def wake(self) -> None:
         self._wake.set()
@@ -198,14 +173,13 @@ class Follower:
             self._wake.clear()
             began, before = REAL.monotonic(), self._newest
             try:
-                commit, commit_state = self._reader.refresh(), before.commit_state
+                commit, source = self._reader.refresh(), before
                 with self.reading():
-                    if commit != commit_state.commit:
-                        snapshot = self._reader.snapshot_after(commit_state.snapshot)
-                        commit_state = _commit_state(self._reader, snapshot)
-                        # so that only the releases that new claims affect are planned
-                        commit_state.take_over(before.commit_state)
-                    now = self._situation_at(commit_state)
+                    if commit != before.commit:
+                        snapshot = self._reader.snapshot_after(before.snapshot)
+                        # only the releases that new claims affect are planned
+                        source = Source.read(self._reader, snapshot).taking_over(before)
+                    now = self._with_reports(source)
             except DemandOpsError as error:
                 now = replace(before, unread=one_line(str(error).replace("\n", "; ")))
             except Exception as error:  # the page must show that it does not follow any more
@@ -219,8 +193,8 @@ class Follower:
                 # The pause keeps the load of the processor low when commits come all the time.
                 self.closed.wait(min(1.0, _PAUSE_FACTOR * (REAL.monotonic() - began)))
 
-    def _situation_at(self, commit_state: CommitState) -> Situation:
-        watch, repository, commit = self._watch, self._reader.repository, commit_state.commit
+    def _with_reports(self, source: Source) -> Source:
+        watch, repository, commit = self._watch, self._reader.repository, source.commit
         last = self.history[0].entry.commit if self.history else ""
         if commit != last:
             new, before = None, self.history
@@ -231,16 +205,12 @@ class Follower:
                 new, before = list(islice(self._reader.log(commit), MOST_COMMITS)), ()
             added = tuple(Commit(entry, self._reader.changed_roots(entry.commit)) for entry in new)
             self.history = (added + before)[:MOST_COMMITS]
-        situation = Situation(
-            commit_state,
-            REAL.now(),
+        source = replace(
+            source,
+            now=REAL.now(),
             watched=watch.clusters,
             proposals=tuple(pending_proposals(repository)),
+            unread="",
+            push_denied="",
         )
-        return watch.with_reports(situation, self._reader) if watch.clusters else situation
-
-
-def _commit_state(reader: Reader, snapshot: Snapshot) -> CommitState:
-    entry = next(reader.log(str(snapshot.commit)))
-    problems = reader.problems_of(snapshot)
-    return CommitState(snapshot, entry, problems, reader.how_to_mend(snapshot))
+        return watch.with_reports(source, self._reader) if watch.clusters else source

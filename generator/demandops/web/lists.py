@@ -17,7 +17,7 @@ from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
 from demandops.views import demand_lists
-from demandops.web.situation import RANKS, WORDS, Situation, word_of, worst_word
+from demandops.views.source import RANKS, WORDS, Source, word_of, worst_word
 
 # ---- lists that can be filtered, sorted and paged, as plain values ----
 
@@ -127,7 +127,7 @@ class ListKind:
     title: str
     about: str
     columns: Mapping[str, str]  # the titles, by the keys of a row's cells
-    entries: Callable[[Situation], Iterator[tuple[str, Values]]]  # each with its id
+    entries: Callable[[Source], Iterator[tuple[str, Values]]]  # each with its id
     # Makes a row of the values of an entry. While these stay the same, it is called again only if
     # the configuration or the overrides have changed.
     row: Callable[..., Row]
@@ -165,12 +165,11 @@ class DemandsList(ListKind):
         "connection|Connections, since|Since, lease|Lease until, request|Request"
     )
 
-    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
-        commit_state = now.commit_state
-        for id, claims in commit_state.claims_of_demands.items():
-            releases = commit_state.releases_of_demands.get(id, [])
+    def entries(self, now: Source) -> Iterator[tuple[str, Values]]:
+        for id, claims in now.claims_of_demands.items():
+            releases = now.releases_of_demands.get(id, [])
             yield id, (claims, releases, worst_word(map(now.status, releases)))
-        for demand in commit_state.state.ledger.waiting.values():
+        for demand in now.state.ledger.waiting.values():
             yield f"waiting {demand.demand}", (demand, [], "waiting")
 
     def row(
@@ -208,11 +207,11 @@ class ServicesList(ListKind):
         "application|For, version|Version, requester|Requesters"
     )
 
-    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
-        for release, _ in now.commit_state.targets:
+    def entries(self, now: Source) -> Iterator[tuple[str, Values]]:
+        for release, _ in now.targets:
             if isinstance(release, ServiceRelease):
                 name = release.name
-                claims = now.commit_state.claims_of_releases[name]
+                claims = now.claims_of_releases[name]
                 yield name, (release, claims, word_of(now.status(name)))
 
     def row(self, world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
@@ -242,10 +241,10 @@ class ConnectionsList(ListKind):
         "requester|Requesters, release|Releases"
     )
 
-    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
-        ledger = now.commit_state.active.ledger
+    def entries(self, now: Source) -> Iterator[tuple[str, Values]]:
+        ledger = now.active.ledger
         clients_of: dict[str, list[str]] = {}
-        for name, release in now.commit_state.releases.items():
+        for name, release in now.releases.items():
             if not isinstance(release, ServiceRelease):
                 for id in release.connections:
                     clients_of.setdefault(id, []).append(name)
@@ -285,8 +284,8 @@ class LeasesList(ListKind):
         "term|Term, slack|Slack"
     )
 
-    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
-        for claim in now.commit_state.state.ledger:
+    def entries(self, now: Source) -> Iterator[tuple[str, Values]]:
+        for claim in now.state.ledger:
             if claim.lease is not None:
                 yield f"{claim.subject} {claim.demand}", (claim,)
 
@@ -315,9 +314,9 @@ LISTS: dict[str, ListKind] = {
 }
 
 
-def rows_of(now: Situation, name: str) -> list[Row]:
-    commit_state, kind = now.commit_state, LISTS[name]
-    statuses, shown = commit_state.rows.get(name, (None, {}))
+def rows_of(now: Source, name: str) -> list[Row]:
+    kind = LISTS[name]
+    statuses, shown = now.rows.get(name, (None, {}))
     # the follower makes a new mapping of statuses whenever it looks, so the same mapping means that
     # nothing has changed
     if statuses is not now.statuses:
@@ -325,7 +324,7 @@ def rows_of(now: Situation, name: str) -> list[Row]:
         for id, values in kind.entries(now):
             before = shown.get(id)
             if before is None or before[0] != values:
-                before = values, kind.row(commit_state.state, *values)
+                before = values, kind.row(now.state, *values)
             rows[id] = before
-        commit_state.rows[name], shown = (now.statuses, rows), rows
+        now.rows[name], shown = (now.statuses, rows), rows
     return [row for _, row in shown.values()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
@@ -19,8 +19,8 @@ from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import GENERATOR_NAME
 from demandops.views import release_causes
+from demandops.views.source import Source, since_of, word_of, worst_word
 from demandops.web.lists import Cell, Filter, Part, Row, cell, exactly
-from demandops.web.situation import CommitState, Situation, since_of, word_of, worst_word
 
 # ---- who can probably fix a release that is not ready ----
 
@@ -129,6 +129,12 @@ class Cause:
     requesters: tuple[str, ...] = ()
     demands: tuple[str, ...] = ()
 
+    @property
+    def is_look(self) -> bool:
+        # the command mends nothing, it only shows more
+        looks = (" describe ", "git show ", "demandops check")
+        return any(look in self.command for look in looks) and "| kubectl" not in self.command
+
     def row(self) -> Row:
         texts = {
             "release": self.releases,
@@ -146,15 +152,13 @@ class Ready:
     causes: tuple[Cause, ...]
 
 
-def causes(
-    now: Situation, wanted: Filter, last_change: LastChange, not_rendered: Collection[str] = ()
-) -> list[Cause]:
+def causes(now: Source, wanted: Filter) -> list[Cause]:
     """Return every cause that matches the filter, the worst kind first, then the oldest."""
     all_causes = [
-        *_unread_or_invalid(now, last_change),
-        *_overridden(now.commit_state, last_change),
-        *_of_releases(now, last_change),
-        *_awaited(now, sorted(not_rendered)),
+        *_unread_or_invalid(now),
+        *_overridden(now),
+        *_of_releases(now),
+        *_awaited(now, sorted(now.not_rendered)),
     ]
     places = {kind: place for place, kind in enumerate(KINDS)}
     latest = now.now.timestamp()
@@ -164,17 +168,17 @@ def causes(
     return [cause for cause in all_causes if wanted.matches(cause.row())]
 
 
-def applications(now: Situation, causes: Iterable[Cause], wanted: Filter) -> list[Ready]:
+def applications(now: Source, causes: Iterable[Cause], wanted: Filter) -> list[Ready]:
     by_application: dict[str, list[Cause]] = {}
     for cause in causes:
         for application in cause.applications:
             by_application.setdefault(application, []).append(cause)
     statuses: dict[str, list[ReleaseStatus]] = {}
     claims_of: dict[str, list[Claim]] = {}
-    for name, release in now.commit_state.releases.items():
+    for name, release in now.releases.items():
         for application in release.applications if isinstance(release, ServiceRelease) else ():
             statuses.setdefault(application, []).append(now.status(name))
-    for claim in now.commit_state.state.ledger:
+    for claim in now.state.ledger:
         if claim.is_on_application:
             claims_of.setdefault(claim.subject.id, []).append(claim)
     shown = []
@@ -191,7 +195,7 @@ def applications(now: Situation, causes: Iterable[Cause], wanted: Filter) -> lis
     return sorted(shown, key=lambda ready: (not ready.causes, ready.application))
 
 
-def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
+def _unread_or_invalid(now: Source) -> Iterator[Cause]:
     if now.unread:
         yield Cause(
             "unread",
@@ -210,26 +214,26 @@ def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Caus
             "let the generator's account push to main",
             told=now.push_denied,
         )
-    for problem in now.commit_state.problems:
-        change = last_change(problem.file)
+    for problem in now.problems:
+        change = now.last_change(problem.file)
         who = "the person who last changed it"
         if problem.author:
             who = f"{problem.author}, whose commit made it invalid"
         field = f", {problem.field}" if problem.field else ""
-        held = now.commit_state.snapshot.configuration
+        held = now.snapshot.configuration
         yield Cause(
             "invalid",
             Part(f"{problem.file or 'The configuration'}{field}"),
             f"is not valid, so the configuration of commit {str(held)[:10]} stays in effect",
             who,
-            now.commit_state.remedy or "correct the file by pull request",
+            now.remedy or "correct the file by pull request",
             f"git show {problem.since[:10]}" if problem.since else "demandops check .",
             told=problem.message,
             since=change.time if change else None,
         )
 
 
-def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
+def _overridden(now: Source) -> Iterator[Cause]:
     def denial(
         override: Override,
         what: Part,
@@ -239,7 +243,7 @@ def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[
         releases: tuple[str, ...] = (),
     ) -> Cause:
         ends = f", or wait until the override ends at {override.expires}"
-        change = last_change(override.path)
+        change = now.last_change(override.path)
         return Cause(
             "suspended",
             what,
@@ -256,23 +260,23 @@ def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[
         )
 
     by_override: dict[str, tuple[Override, list[Claim]]] = {}
-    for claim, override in suspended_claims(commit_state.state):
+    for claim, override in suspended_claims(now.state):
         by_override.setdefault(override.name, (override, []))[1].append(claim)
     for override, suspended in by_override.values():
         names = dict.fromkeys(claim.subject.id for claim in suspended)
         what = Part(" and ".join(names), "overrides")
-        applications = _applications_with(commit_state, suspended)
+        applications = _applications_with(now, suspended)
         yield denial(override, what, "is booked", suspended, applications)
     # the claims that need a denied release are not suspended as a whole
-    for release, override in commit_state.denied:
-        needing = release_causes.claims_behind(commit_state.active.ledger, release)
+    for release, override in now.denied:
+        needing = release_causes.claims_behind(now.active.ledger, release)
         what = Part(release.description, "release", {"name": release.name})
         served = release.applications if isinstance(release, ServiceRelease) else ()
         yield denial(override, what, "is needed", needing, served, (release.name,))
 
 
-def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
-    for waiting in in_turn(now.commit_state.state.ledger.waiting):
+def _awaited(now: Source, not_rendered: list[str]) -> Iterator[Cause]:
+    for waiting in in_turn(now.state.ledger.waiting):
         yield Cause(
             "waiting",
             Part(waiting.demand, "demands", {"q": exactly("demand", waiting.demand)}),
@@ -325,48 +329,57 @@ def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
             "the operator of the generator",
             "start a generator; a running generator carries out the commit at its next fetch",
             told=", ".join(not_rendered[:_MOST_LISTED]) + more,
-            since=now.commit_state.entry.time,
+            since=now.entry.time,
         )
 
 
-def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
-    together: dict[tuple[str, str, str, str], list[str]] = {}
-    for name, release in now.commit_state.releases.items():
-        status = now.status(name)
-        word = word_of(status)
+def _of_releases(now: Source) -> Iterator[Cause]:
+    # One reason of several objects is one cause, with the command for the first object.
+    together: dict[tuple[Kind, str, str, str, str, str], list[tuple[str, str]]] = {}
+    kinds: dict[str, Kind] = {"failing": "failing", "waiting": "waiting"}
+    for name, release in now.releases.items():
+        health, word = now.status(name).health, word_of(now.status(name))
         if word not in ("healthy", "unknown"):
-            health = status.health
-            key = (word, health.object, health.reason, release.node.cluster)
-            together.setdefault(key, []).append(name)
-    for (word, object, reason, cluster), names in together.items():
-        releases = [now.commit_state.releases[name] for name in names]
-        first, several = releases[0], len(names) > 1
-        what = Part(first.description, "release", {"name": names[0]})
+            kind, reason = kinds.get(word, "starting"), health.reason
+            who, how, command = remedy_of(
+                kind, release, now.config, health.object, reason, now.last_change
+            )
+            is_cluster = health.object.startswith("cluster ")
+            sort = health.object if is_cluster else health.object.partition(" ")[0]
+            key = kind, sort, reason, release.node.cluster, who, how
+            together.setdefault(key, []).append((name, command))
+    for (kind, sort, reason, cluster, who, how), members in together.items():
+        names = [name for name, _ in members]
+        releases, several = [now.releases[name] for name in names], len(names) > 1
+        what = Part(releases[0].description, "release", {"name": names[0]})
         if several:
-            query = {"q": f"cluster={cluster}"}
-            what = Part(f"{len(names)} releases in {cluster}", "services", query)
-        kind: Kind = "failing" if word == "failing" else "starting"
+            query = f"{exactly('cluster', cluster)} {exactly('health', kind)}"
+            what = Part(f"{len(names)} releases in {cluster}", "services", {"q": query})
         fail, have, are = ("fail", "have", "are") if several else ("fails", "has", "is")
         why = fail if kind == "failing" else f"{are} starting and not ready yet"
-        if word == "waiting":
-            kind, why = "waiting", f"{have} not been applied by the cluster yet"
-        if object.startswith("cluster "):
-            why = f"cannot be seen, because {object} cannot be read"
-        claims = [claim for name in names for claim in now.commit_state.claims_of_releases[name]]
+        if kind == "waiting":
+            why = f"{have} not been applied by the cluster yet"
+        objects = dict.fromkeys(now.status(name).health.object for name in names)
+        object = next(iter(objects)) + (" and others" if len(objects) > 1 else "")
+        if sort.startswith("cluster "):
+            why = f"cannot be seen, because {sort} cannot be read"
+        claims = [claim for name in names for claim in now.claims_of_releases[name]]
         applications: dict[str, None] = {}
         for name, release in zip(names, releases, strict=True):
             # a connection is needed by the applications of the demands that hold it
             applications |= dict.fromkeys(
                 release.applications
                 if isinstance(release, ServiceRelease)
-                else _applications_with(now.commit_state, now.commit_state.claims_of_releases[name])
+                else _applications_with(now, now.claims_of_releases[name])
             )
         times = filter(None, (since_of(now.status(name)) for name in names))
         yield Cause(
             kind,
             what,
             why,
-            *remedy_of(kind, first, now.commit_state.config, object, reason, last_change),
+            who,
+            how,
+            members[0][1],
             since=min(times, default=None),
             told=f"{object}: {reason}" if object else reason,
             releases=tuple(names),
@@ -376,8 +389,8 @@ def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
         )
 
 
-def _applications_with(commit_state: CommitState, claims: Iterable[Claim]) -> Iterator[str]:
+def _applications_with(now: Source, claims: Iterable[Claim]) -> Iterator[str]:
     """Yield the ids of all applications of the demands to which these claims belong."""
     for demand in dict.fromkeys(claim.demand for claim in claims):
-        held = commit_state.claims_of_demands.get(demand, ())
+        held = now.claims_of_demands.get(demand, ())
         yield from (claim.subject.id for claim in held if claim.is_on_application)

@@ -18,14 +18,14 @@ from demandops.render.gitops import path_of
 from demandops.repo.reader import Reader
 from demandops.views import release_causes
 from demandops.views.release_causes import how_to_release, is_released_by_demand_id
-from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of
+from demandops.views.source import WORDS, Source, since_of, word_of
 
 # ---- the view of one demand ----
 
 
-def explained_demand(now: Situation, reader: Reader, id: str) -> dict[str, Any]:
-    if not (claims := now.commit_state.claims_of_demands.get(id)):
-        waiting = now.commit_state.state.ledger.waiting.values()
+def explained_demand(now: Source, reader: Reader, id: str) -> dict[str, Any]:
+    if not (claims := now.claims_of_demands.get(id)):
+        waiting = now.state.ledger.waiting.values()
         is_waiting = any(demand.demand == id for demand in waiting)
         why = ", because it waits for room on a node" if is_waiting else ""
         raise StateRepoError(f"demand {quoted(id)} holds nothing{why}")
@@ -39,15 +39,15 @@ def explained_demand(now: Situation, reader: Reader, id: str) -> dict[str, Any]:
     }
     released, refused = None, ""
     try:
-        read = reader.file_reader(now.commit_state.commit)
-        released = decide(now.commit_state.state, goal, now.now, read)
+        read = reader.file_reader(now.commit)
+        released = decide(now.state, goal, now.now, read)
     except InvalidInput as error:
         refused = str(error)
     return {
         "id": id,
         "claims": claims,
         "requesters": requesters,
-        "releases": now.commit_state.releases_of_demands.get(id, []),
+        "releases": now.releases_of_demands.get(id, []),
         "how": how_to_release(claims[0]),
         # for `demandops request`
         "file": strict_yaml.dump(goal) if is_released_by_demand_id(claims[0]) else "",
@@ -59,18 +59,15 @@ def explained_demand(now: Situation, reader: Reader, id: str) -> dict[str, Any]:
 # ---- the view of one release ----
 
 
-def explained_release(now: Situation, reader: Reader, name: str) -> dict[str, Any]:
-    commit_state = now.commit_state
-    release = commit_state.releases.get(name)
-    denied = None if release else release_causes.denied_release_named(commit_state.state, name)
+def explained_release(now: Source, reader: Reader, name: str) -> dict[str, Any]:
+    release = now.releases.get(name)
+    denied = None if release else release_causes.denied_release_named(now.state, name)
     planned = release or (denied[0] if denied else None)
     path = path_of(planned) if planned else None
-    path = path or reader.release_path(name, commit_state.commit)
+    path = path or reader.release_path(name, now.commit)
     if path is None:
-        raise StateRepoError(
-            f"up to commit {commit_state.commit[:10]}, there was no release {quoted(name)}"
-        )
-    history = reader.history(path, commit_state.commit, most=20)
+        raise StateRepoError(f"up to commit {now.commit[:10]}, there was no release {quoted(name)}")
+    history = reader.history(path, now.commit, most=20)
     last = next(iter(history.newest), None) or history.started
     if history.stopped and not release:
         last = history.stopped
@@ -83,7 +80,7 @@ def explained_release(now: Situation, reader: Reader, name: str) -> dict[str, An
         for line in list(lines)[2:]:  # without the two lines that name the files
             sign = line[:1].strip()
             difference.append({"sign": sign, "text": line if sign == "@" else line[1:]})
-    status, claims = now.status(name), commit_state.claims_of_releases.get(name, [])
+    status, claims = now.status(name), now.claims_of_releases.get(name, [])
     word = word_of(status) if release else "stopped"
     return {
         "name": name,
@@ -96,19 +93,19 @@ def explained_release(now: Situation, reader: Reader, name: str) -> dict[str, An
         "since": since_of(status),
         "claims": claims,
         "requesters": requesters_of(claims),
-        "files": release_causes.shaping_files(release, commit_state.config) if release else (),
+        "files": release_causes.shaping_files(release, now.config) if release else (),
         "overrides": release.shaping.by if release else (),
-        "text": reader.file_reader(commit_state.commit)(path) or "",
+        "text": reader.file_reader(now.commit)(path) or "",
         "history": history,
         "last_change": last,
         "difference": difference,  # the newest change of the release's file
         # the other releases that the override stops which the page proposes for this one
-        "stop_with_it": list(_others_stopped(commit_state, release)) if release else [],
+        "stop_with_it": list(_others_stopped(now, release)) if release else [],
     }
 
 
-def _others_stopped(commit_state: CommitState, release: Release) -> Iterable[str]:
-    for name, other in commit_state.releases.items():
+def _others_stopped(now: Source, release: Release) -> Iterable[str]:
+    for name, other in now.releases.items():
         if name == release.name:
             continue
         if isinstance(release, ServiceRelease):

@@ -6,9 +6,8 @@ import logging
 import shlex
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
-from dataclasses import replace
 from datetime import timezone
-from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -34,12 +33,12 @@ from demandops.base.quoting import escaped, lines
 from demandops.model.config.base_model import relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
-from demandops.views.release_causes import override_state
-from demandops.web import fleet_map, lists, not_ready, time_line
+from demandops.views.source import WORDS, Source
+from demandops.web import fleet_map, lists, not_ready, overview, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Part, Row, rows_of
 from demandops.web.release_view import explained_demand, explained_release
-from demandops.web.situation import WORDS, Situation
+from demandops.web.time_line import Event
 
 # ---- the views, by address ----
 
@@ -47,16 +46,16 @@ from demandops.web.situation import WORDS, Situation
 _KEPT = ("at", "q")
 
 NAVIGATION = (
-    ("", "Not ready"),
+    ("", "Overview"),
     ("map", "Map"),
     *((name, kind.title) for name, kind in LISTS.items()),
     ("timeline", "Time line"),
     ("overrides", "Overrides"),
-    ("rates", "Rates"),
 )
 
 
 _MOST_CAUSES = 100
+_NEWEST = 8  # changes
 
 Data = dict[str, Any]
 View = Callable[["ViewRequest"], tuple[str, Data]]
@@ -67,7 +66,7 @@ class ViewRequest:
         self.follower = follower
         self.path = request.url.path.strip("/")
         self.params = dict(request.query_params)
-        self.situation: Situation = follower.at(self.get("at"))
+        self.source: Source = follower.at(self.get("at"))
         self.filter = Filter(self.get("q"))
 
     def get(self, name: str) -> str:
@@ -87,28 +86,34 @@ class ViewRequest:
         query = f"?{urlencode(params)}" if params else ""
         return f"/{self.path if path is None else path}{query}"
 
+    def events(self) -> list[Event]:
+        every = time_line.events(self.follower.history, self.follower.health_changes)
+        return [event for event in every if not self.filter or self.filter.matches(event.row())]
+
     def link(self, part: Part) -> str:
         # with its own filter instead of the current one
         return self.to(part.view, **{"q": "", **part.params})
 
 
-def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
-    commit_state = asked.situation.commit_state
-    last_change = partial(asked.follower.last_change, commit_state)
-    pending = asked.follower.not_rendered(commit_state)
-    causes = not_ready.causes(asked.situation, asked.filter, last_change, pending)
-    applications = not_ready.applications(asked.situation, causes, asked.filter)
-    return "not_ready.html.j2", {
+def _overview(asked: ViewRequest) -> tuple[str, Data]:
+    source = asked.source
+    causes = not_ready.causes(source, asked.filter)
+    moment = source.now if source.is_newest else source.entry.time
+    events = [event for event in asked.events() if event.time <= moment]
+    return "overview.html.j2", {
+        "figures": overview.figures(source, asked.filter, events, moment),
         "causes": causes[:_MOST_CAUSES],
         "total": len(causes),
-        "applications": applications,
+        "applications": not_ready.applications(source, causes, asked.filter),
         "tones": {**WORDS, **not_ready.KINDS},
+        "events": islice(overview.newest(events), _NEWEST),
+        "overrides": source.overrides,
     }
 
 
 def _list(asked: ViewRequest) -> tuple[str, Data]:
     kind, sort = LISTS[asked.path], asked.get("sort")  # `-` before a key is the reverse order
-    rows = rows_of(asked.situation, asked.path)
+    rows = rows_of(asked.source, asked.path)
     matching = [row for row in rows if asked.filter.matches(row)]
     if (key := sort.removeprefix("-")) not in kind.columns:
         sort = key = next(iter(kind.columns))
@@ -126,20 +131,18 @@ def _list(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _timeline(asked: ViewRequest) -> tuple[str, Data]:
-    now, lane = asked.situation, asked.get("lane")
+    now, lane = asked.source, asked.get("lane")
     lanes = {lane} if lane in time_line.LANES else time_line.LANES
-    events = [
-        event
-        for event in time_line.events(asked.follower.history, asked.follower.health_changes)
-        if event.lane in lanes and (not asked.filter or asked.filter.matches(event.row()))
-    ]
-    chosen = None if now.is_newest else (now.commit_state.entry.time, now.commit_state.commit)
+    events = [event for event in asked.events() if event.lane in lanes]
+    span, events = time_line.within(events, asked.get("span"), now.now)
+    chosen = None if now.is_newest else (now.entry.time, now.commit)
     changed: list[str] = []
     if asked.get("at"):
-        changed = asked.follower.reader().files_changed_by(now.commit_state.commit)
+        changed = asked.follower.reader().files_changed_by(now.commit)
     shown, page, pages = lists.page_of(events, asked.page(), size=50)
     return "timeline.html.j2", {
-        "strip": time_line.strip(events, now.now, asked.get("span"), chosen),
+        "strip": time_line.strip(events, now.now, span, chosen),
+        "span": span,
         "lanes": time_line.LANES,
         "lane": lane,
         "spans": time_line.SPANS,
@@ -153,10 +156,8 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _overrides(asked: ViewRequest) -> tuple[str, Data]:
-    now, entries = asked.situation, []
-    pending = asked.follower.not_rendered(now.commit_state)
-    for entry in now.commit_state.override_entries(now.now):
-        state = override_state(entry, now.commit_state.state, pending)
+    entries = []
+    for entry in asked.source.overrides:
         texts = {
             "owner": [entry.override.owner],
             "reason": [entry.override.reason],
@@ -165,41 +166,27 @@ def _overrides(asked: ViewRequest) -> tuple[str, Data]:
             "requester": [who for claim in entry.claims for who in claim.requesters],
         }
         if asked.filter.matches(Row({"override": lists.cell(entry.override.name)}, texts)):
-            entries.append(replace(entry, state=state))
+            entries.append(entry)
     return "overrides.html.j2", {"entries": entries}
 
 
-def _rates(asked: ViewRequest) -> tuple[str, Data]:
-    span = asked.get("span") if asked.get("span") in time_line.SPANS else "1d"
-    health = asked.follower.health_changes
-    commits = [
-        commit
-        for commit in asked.follower.history
-        if asked.filter.matches(time_line.of_commit(commit).row())
-    ]
-    plots = time_line.plots(commits, health, asked.situation.now, span)
-    size = {"width": time_line.WIDTH, "height": time_line.HEIGHT}
-    return "rates.html.j2", {"plots": plots, "span": span, "spans": time_line.SPANS, **size}
-
-
 VIEWS: Mapping[str, View] = {
-    "/": _not_ready,
+    "/": _overview,
     "/map": lambda asked: (
         "map.html.j2",
-        {"map": fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))},
+        {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
     ),
     **{f"/{name}": _list for name in LISTS},
     "/demand": lambda asked: (
         "demand.html.j2",
-        {"demand": explained_demand(asked.situation, asked.follower.reader(), asked.get("id"))},
+        {"demand": explained_demand(asked.source, asked.follower.reader(), asked.get("id"))},
     ),
     "/release": lambda asked: (
         "release.html.j2",
-        {"release": explained_release(asked.situation, asked.follower.reader(), asked.get("name"))},
+        {"release": explained_release(asked.source, asked.follower.reader(), asked.get("name"))},
     ),
     "/timeline": _timeline,
     "/overrides": _overrides,
-    "/rates": _rates,
 }
 
 
@@ -313,9 +300,8 @@ class Site:
                 common = {
                     "navigation": NAVIGATION,
                     "here": asked,
-                    "now": asked.situation.now,
-                    "situation": asked.situation,
-                    "commit_state": asked.situation.commit_state,
+                    "now": asked.source.now,
+                    "source": asked.source,
                     "exactly": lists.exactly,
                     "program": __version__,
                     "has_docs": self._has_docs,

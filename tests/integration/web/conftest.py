@@ -6,18 +6,17 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import pytest
 import yaml
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
+from demandops.views.source import Source
 from demandops.web import not_ready
 from demandops.web.follower import Follower
 from demandops.web.lists import Filter
 from demandops.web.server import Site
-from demandops.web.situation import Situation
 from starlette.testclient import TestClient
 
 from tests.kit import goals
@@ -25,7 +24,7 @@ from tests.kit.generator import book, running, wait_until
 from tests.kit.html import Page
 
 VIEWS = ("/", "/map", "/demands", "/services", "/connections", "/leases", "/timeline",
-         "/overrides", "/rates")  # fmt: skip
+         "/overrides")  # fmt: skip
 DENY = """apiVersion: demandops/v1
 kind: Override
 reason: The road is closed
@@ -49,7 +48,7 @@ class Shown:
     def look(self, path: str, status: int = 200, **params: str) -> Page:
         """Wait until the site shows the newest commit, then return the page at a path."""
         wait_until(
-            lambda: self.follower.newest.commit_state.commit == str(self.generator.snapshot.commit),
+            lambda: self.follower.newest.commit == str(self.generator.snapshot.commit),
             "the page has the newest commit",
         )
         answer = self.client.get(path, params=params)
@@ -102,5 +101,5 @@ def look(shown: Shown) -> Look:
     return shown.look
 
 
-def causes(now: Situation, follower: Follower, text: str = "") -> list[not_ready.Cause]:
-    return not_ready.causes(now, Filter(text), partial(follower.last_change, now.commit_state))
+def causes(now: Source, text: str = "") -> list[not_ready.Cause]:
+    return not_ready.causes(now, Filter(text))

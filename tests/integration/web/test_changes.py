@@ -19,7 +19,6 @@ from demandops.web import fleet_map, server
 from demandops.web.follower import Follower
 from demandops.web.lists import LISTS, Filter, rows_of
 from demandops.web.server import Site
-from demandops.web.situation import CommitState
 from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import DENY, VIEWS, Look, causes
@@ -55,12 +54,12 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     overridden(booked)
     page = look("/")
     assert page.texts("h1") == ["1 of 1 application is not ready"]
-    (cause,) = causes(follower.newest, follower)
+    (cause,) = causes(follower.newest)
     assert (cause.kind, cause.told) == ("suspended", "The road is closed")
     assert cause.who == "traffic-control, who owns the override"
     assert cause.command == "git rm overrides/roadworks.yaml"
     assert cause.requesters == ("station00", "vehicle01")
-    changed = follower.last_change(follower.newest.commit_state, "overrides/roadworks.yaml")
+    changed = follower.newest.last_change("overrides/roadworks.yaml")
     assert changed and cause.since == changed.time
     assert "vehicle01/edge is booked, but overrides/roadworks.yaml denies it" in page.text
     assert "vehicle01/edge" not in look("/connections").text
@@ -86,7 +85,7 @@ def test_an_invalid_file_names_who_wrote_it(
     person.change({"registry/images.yaml": "images: [\n"}, "Break it")
     broken(booked)
     page = look("/")
-    (cause,) = causes(follower.newest, follower)
+    (cause,) = causes(follower.newest)
     assert cause.kind == "invalid"
     assert cause.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
     assert cause.command.startswith("git show ")
@@ -211,23 +210,23 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
         node["position"] = {"x": 10.0 * (number % 3), "y": float(number)}
     person.change({path: yaml.safe_dump(nodes)})
     wait_until(
-        lambda: all(node.position for node in follower.newest.commit_state.config.nodes.values()),
+        lambda: all(node.position for node in follower.newest.config.nodes.values()),
         "the nodes have positions",
     )
     drawn = fleet_map.picture(follower.newest, Filter(""), "")
     assert (drawn["layout"], drawn["layouts"]) == ("place", ("cluster", "place"))
     for layout in drawn["layouts"]:
-        cards = fleet_map.picture(follower.newest, Filter(""), layout)["nodes"]
-        for one in cards:
-            assert one.x >= 0 and one.x + one.width <= fleet_map.WIDTH
-            assert not [o for o in cards if o is not one and _cover(one, o)]
-    by_id = {card.id: card for card in drawn["nodes"]}
+        for drawing in fleet_map.picture(follower.newest, Filter(""), layout)["drawings"]:
+            for card in drawing.cards:
+                assert card.x >= 0 and card.x + card.width <= drawing.width
+                assert not [o for o in drawing.cards if o is not card and _cover(card, o)]
+    by_id = {card.label: card for card in drawn["drawings"][0].cards}
     ids = [node["id"] for node in nodes["nodes"]]
     assert by_id[ids[0]].x < by_id[ids[1]].x < by_id[ids[2]].x
     assert by_id[ids[-1]].y < by_id[ids[0]].y
 
 
-def _cover(one: fleet_map.NodeCard, other: fleet_map.NodeCard) -> bool:
+def _cover(one: fleet_map.Card, other: fleet_map.Card) -> bool:
     beside = one.x + one.width <= other.x or other.x + other.width <= one.x
     return not (beside or one.y + one.height <= other.y or other.y + other.height <= one.y)
 
@@ -259,7 +258,7 @@ def test_views_derived_step_by_step_equal_views_derived_from_scratch(
     scaling = "{max: 4, per: {sources: 1}, dividesWork: true}"
     text = person.read(appdef).replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")
     person.change({appdef: text}, "Scale")
-    wait_until(lambda: follower.newest.commit_state.config.files[appdef] == text, "it is shown")
+    wait_until(lambda: follower.newest.config.files[appdef] == text, "it is shown")
     joins = [yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT]
     another = copy.deepcopy(joins[0]) | {"connections": []}
     another["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station01"]
@@ -272,10 +271,9 @@ def _assert_taken_over(follower: Follower, look: Look) -> None:
     for name in LISTS:
         look(f"/{name}")
     now = follower.newest
-    state = CommitState(now.commit_state.snapshot, now.commit_state.entry, ())
-    anew = replace(now, commit_state=state)
-    assert now.commit_state.targets == anew.commit_state.targets
-    assert now.commit_state.claims_of_releases == anew.commit_state.claims_of_releases
+    anew = replace(now, derived={})
+    assert now.targets == anew.targets
+    assert now.claims_of_releases == anew.claims_of_releases
     for name in LISTS:
         assert sorted(map(str, rows_of(now, name))) == sorted(map(str, rows_of(anew, name)))
 

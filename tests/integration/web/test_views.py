@@ -15,12 +15,12 @@ from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
+from demandops.views.source import Source
 from demandops.web import fleet_map, time_line
 from demandops.web.follower import Follower
 from demandops.web.lists import Filter, page_of, rows_of
 from demandops.web.not_ready import remedy_of
 from demandops.web.release_view import explained_demand
-from demandops.web.situation import CommitState, Situation
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes
@@ -42,21 +42,18 @@ def bare(still: Shown) -> Path:
     return still.bare
 
 
-def with_health(follower: Follower, **named: Health) -> Situation:
-    statuses = {
-        name: ReleaseStatus(Health("healthy"), "abc")
-        for name in follower.newest.commit_state.releases
-    }
+def with_health(follower: Follower, **named: Health) -> Source:
+    statuses = {name: ReleaseStatus(Health("healthy"), "abc") for name in follower.newest.releases}
     for name, health in named.items():
         statuses[name.replace("_", "-")] = ReleaseStatus(health, "abc", "2026-05-04T12:00:00Z")
     return replace(follower.newest, statuses=statuses, watched=frozenset({"c-its"}))
 
 
-def changed(follower: Follower, **fields: Any) -> Situation:
-    """Return the newest situation with other fields of its state."""
-    shown = follower.newest.commit_state
+def changed(follower: Follower, **fields: Any) -> Source:
+    """Return the newest source with other fields of its state."""
+    shown = follower.newest
     snapshot = replace(shown.snapshot, state=replace(shown.state, **fields))
-    return replace(follower.newest, commit_state=CommitState(snapshot, shown.entry, ()))
+    return replace(shown, snapshot=snapshot, problems=(), derived={})
 
 
 def test_without_clusters_the_page_says_what_it_cannot_know(look: Look) -> None:
@@ -76,21 +73,21 @@ def test_without_clusters_the_page_says_what_it_cannot_know(look: Look) -> None:
 def test_a_failing_release_names_who_can_mend_it(follower: Follower, reason: str, who: str) -> None:
     health = Health("reconciled", reason, "HelmRelease perception/od-edge-vehicle00", failing=True)
     now = with_health(follower, od_edge_vehicle00=health)
-    (cause,) = causes(now, follower)
+    (cause,) = causes(now)
     assert cause.who.startswith(who)
     assert cause.command == "kubectl -n perception describe helmrelease od-edge-vehicle00"
     assert cause.told == f"HelmRelease perception/od-edge-vehicle00: {reason}"
     assert cause.applications == ("edge/object_detection_fusion",)
     assert cause.requesters == ("station00", "vehicle00")
     assert f"{cause.since:%Y-%m-%d %H:%M}" == "2026-05-04 12:00"
-    assert causes(now, follower, "vehicle00") and not causes(now, follower, "requester=vehicle01")
+    assert causes(now, "vehicle00") and not causes(now, "requester=vehicle01")
 
 
 def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
     away = Health("waiting", "cannot be read: it is away", "cluster c-its")
-    names = [name.replace("-", "_") for name in follower.newest.commit_state.releases]
+    names = [name.replace("-", "_") for name in follower.newest.releases]
     now = with_health(follower, **dict.fromkeys(names, away))
-    (cause,) = causes(now, follower)
+    (cause,) = causes(now)
     assert cause.kind == "waiting" and len(cause.releases) == len(names)
     assert cause.who == "the operator of cluster c-its"
     assert cause.why == "cannot be seen, because cluster c-its cannot be read"
@@ -100,11 +97,10 @@ def test_a_failing_release_without_images_in_the_registry_names_its_maintainer(
     follower: Follower,
 ) -> None:
     health = Health("reconciled", "ImagePullBackOff", "HelmRelease perception/x", failing=True)
-    commit_state = follower.newest.commit_state
-    release = commit_state.releases[DETECTION]
+    release = follower.newest.releases[DETECTION]
     assert isinstance(release, ServiceRelease)
     bare = replace(release, service=release.service.model_copy(update={"images": ()}))
-    config = commit_state.config
+    config = follower.newest.config
     found = remedy_of("failing", bare, config, health.object, health.reason, lambda path: None)
     assert found[0] == "the maintainer of appdefs/object-detection-fusion"
 
@@ -112,12 +108,12 @@ def test_a_failing_release_without_images_in_the_registry_names_its_maintainer(
 def test_not_everything_is_ready_while_a_cluster_is_not_watched(
     shown: Shown, follower: Follower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    situation = with_health(follower)
-    # the follower's thread may set its own newest situation at any time
-    monkeypatch.setattr(Follower, "newest", property(lambda self: situation))
+    source = with_health(follower)
+    # the follower's thread may set its own newest source at any time
+    monkeypatch.setattr(Follower, "newest", property(lambda self: source))
     assert shown.look("/").texts("h1") == ["Everything is ready"]
     assert shown.look("/", q="vehicle00").texts("h1") == ["Everything that matches is ready"]
-    situation = replace(situation, watched=frozenset({"other"}))
+    source = replace(source, watched=frozenset({"other"}))
     page = shown.look("/")
     assert page.texts("h1") == ["Nothing in the state repo keeps an application from being ready"]
     assert "Whether pods run on c-its is unknown" in page.text
@@ -132,7 +128,7 @@ def test_an_old_bootstrap_file_and_an_object_of_no_release_are_causes(follower: 
     old = OldBootstrap("c-its", "bootstrap/c-its.yaml", ("perception",), "git show …")
     left = Orphan("c-its", "Deployment", "perception", "mqtt-gone")
     now = replace(follower.newest, old_bootstraps=(old,), orphans=(left,))
-    told = {cause.what.text: cause for cause in causes(now, follower)}
+    told = {cause.what.text: cause for cause in causes(now)}
     assert told.keys() == {"bootstrap/c-its.yaml", "Deployment perception/mqtt-gone"}
     assert told["bootstrap/c-its.yaml"].command == old.command
     assert told["Deployment perception/mqtt-gone"].command == left.command
@@ -197,39 +193,84 @@ def test_the_page_shows_the_claims_at_an_earlier_commit(look: Look, state: GitRe
 
 def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:
     now = follower.newest
-    demand = next(
-        one.demand for one in now.commit_state.state.ledger if "vehicle01" in one.requesters
-    )
-    lit = fleet_map.picture(now, Filter(f"demand={demand}"), "")
-    assert {node.id for node in lit["nodes"] if node.is_lit} == {"edge", "station00", "vehicle01"}
-    services = {one.name for node in lit["nodes"] for one in node.services if one.is_lit}
-    assert DETECTION not in services and "od-edge-station00" in services
+    demand = next(one.demand for one in now.state.ledger if "vehicle01" in one.requesters)
+    wide, _ = fleet_map.picture(now, Filter(f"demand={demand}"), "")["drawings"]
+    lit = [card for card in wide.cards if card.is_lit]
+    assert {card.label for card in lit} == {"edge", "station00", "vehicle01"}
+    on_edge = {mark.text: mark.is_lit for card in lit for mark in card.marks}
+    assert on_edge["object-detection · station00"] and on_edge["mqtt vehicle01/edge"]
+    assert not on_edge["object-detection · vehicle00"]
 
 
-def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: Follower) -> None:
-    config = follower.newest.commit_state.config
-    model, far = next(iter(config.nodes.values())), [f"far{number}" for number in range(1000)]
-    nodes = {**config.nodes, **{id: model.model_copy(update={"id": id}) for id in far}}
-    now = changed(follower, config=replace(config, nodes=nodes))
-    state = now.commit_state.state
-    drawn = fleet_map.picture(now, Filter(""), "")
-    assert (drawn["nodes"], drawn["total"]) == ([], len(state.config.nodes))
-    squares = sum(path.count("M") for _, path in drawn["many_nodes"])
-    assert squares == len(state.config.nodes)
-    few = fleet_map.picture(now, Filter("node=far7"), "")
-    assert [node.id for node in few["nodes"]] == ["far7"] and few["only_lit"]
-    # the filter finds too many nodes to draw them alone, so the whole fleet is drawn
-    many = fleet_map.picture(now, Filter("node:far"), "")
-    assert many["is_dimmed"] and {node.id for node in many["nodes"]} == set(far)
+def fleet_of(follower: Follower, vehicles: int, edges: int = 1) -> Source:
+    """Return the newest source with more nodes, which demand nothing."""
+    config = follower.newest.config
+    model, more = config.nodes["vehicle00"], dict(config.nodes)
+    for type, count in (("edge", edges), ("vehicle", vehicles)):
+        for number in range(count):
+            id = f"far-{type}{number}"
+            more[id] = model.model_copy(update={"id": id, "type": type})
+    return changed(follower, config=replace(config, nodes=more))
+
+
+def test_many_nodes_are_drawn_as_stacks_that_a_filter_opens(follower: Follower) -> None:
+    source = fleet_of(follower, 1000)
+    for drawing in fleet_map.picture(source, Filter(""), "")["drawings"]:
+        assert sum(len(card.nodes) for card in drawing.cards) == len(source.config.nodes)
+        (stack,) = [card for card in drawing.cards if len(card.nodes) >= 1000]
+        assert stack.label.endswith(" vehicles")
+    # a stack's own filter chooses its nodes, and a filter that finds few draws each of them
+    for query, count in ((stack.query, len(stack.nodes)), ("node=far-vehicle7", 1)):
+        found = fleet_map.picture(source, Filter(query), "")
+        assert found["lit"] == count
+    (lit,) = [card for card in found["drawings"][0].cards if card.is_lit]
+    assert lit.label == "far-vehicle7" and len(found["drawings"][0].cards) < 20
+
+
+@pytest.mark.parametrize("query", ["", "edge", "vehicle01"])
+@pytest.mark.parametrize(("vehicles", "edges"), [(0, 0), (25, 20), (200, 20)])
+def test_no_line_runs_behind_a_card(
+    follower: Follower, vehicles: int, edges: int, query: str
+) -> None:
+    source = fleet_of(follower, vehicles, edges)
+    for drawing in fleet_map.picture(source, Filter(query), "cluster")["drawings"]:
+        assert drawing.lines
+        for line in drawing.lines:
+            for x, y in points(line.path):
+                assert 0 <= x <= drawing.width and 0 <= y <= drawing.height
+                assert not [
+                    card.label
+                    for card in drawing.cards
+                    if card.x < x < card.x + card.width and card.y < y < card.y + card.height
+                ]
+
+
+def points(path: str) -> list[tuple[float, float]]:
+    """Return points on a path of the commands M, V and C, close to each other."""
+    here, found = (0.0, 0.0), list[tuple[float, float]]()
+    for command, text in re.findall(r"([MVC])([^MVC]*)", path):
+        numbers = [float(number) for number in text.split()]
+        if command == "V":
+            numbers = [here[0], here[1], here[0], numbers[0], here[0], numbers[0]]
+        ends = list(zip(numbers[::2], numbers[1::2], strict=True))
+        if command != "M":
+            for step in range(33):
+                t = step / 32
+                weights = ((1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3)
+                at = zip(*(here, *ends), strict=True)
+                x, y = (sum(w * v for w, v in zip(weights, values, strict=True)) for values in at)
+                found.append((x, y))
+        here = ends[-1]
+    return found
 
 
 def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     newest = follower.newest
     since = newest.now - timedelta(minutes=5)
     waiting = WaitingDemand(read_goal(put("later", "vehicle02")), since)
-    ledger = replace(newest.commit_state.state.ledger, waiting=HashTrieMap({"later": waiting}))
+    ledger = replace(newest.state.ledger, waiting=HashTrieMap({"later": waiting}))
     now = changed(follower, ledger=ledger)
-    (cause,) = causes(now, follower, "vehicle02")
+    (cause,) = causes(now, "vehicle02")
     assert (cause.kind, cause.what.text, cause.since) == ("waiting", "later", since)
     assert cause.why == "waits for room on a node"
     rows = [row for row in rows_of(now, "demands") if Filter("demand=later").matches(row)]

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.errors import InvalidInput, Refused
+from demandops.decide.bookkeeping import bookkeeping
 from demandops.decide.state import rendered_files
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
-from demandops.views.bookkeeping import bookkeeping
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -13,13 +13,13 @@ from demandops.base.quoting import lines, one_line
 from demandops.cli.json_output import Json, output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.queries.diff import entry_lines, release_lines
+from demandops.decide.bookkeeping import EntryChange
 from demandops.decide.changeset import CHANGE_ORDER, FileChange, MergePreview
 from demandops.repo.merge_check import merge_check
 from demandops.repo.merge_check.merge_check import CheckResult
 from demandops.repo.merge_check.rendered_charts import MISSING, NO_HELM, RenderedCharts
 from demandops.serve.approvals.proposal import backticks
 from demandops.templating.evaluator import processor_time
-from demandops.views.bookkeeping import EntryChange
 
 # ---- the result as a comment on a pull request ----
 #

@@ -10,9 +10,9 @@ from demandops.cli.queries.diff import loaded
 from demandops.cli.queries.get import KINDS
 from demandops.cli.table import Table, column, joined, table_of
 from demandops.cli.target import state_repo_option
+from demandops.decide.bookkeeping import as_data
+from demandops.decide.bookkeeping import bookkeeping as derive
 from demandops.repo import reader
-from demandops.views.bookkeeping import as_data
-from demandops.views.bookkeeping import bookkeeping as derive
 
 
 @click.command()

@@ -10,12 +10,12 @@ import click
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import SIGNS, progress, warn_of_problems
 from demandops.cli.target import state_repo_option
+from demandops.decide.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 from demandops.decide.changeset import MergePreview, ReleaseChange, planned_releases, preview
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
-from demandops.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 
 
 @click.command()

@@ -28,6 +28,8 @@ from demandops.cli.output import (
 from demandops.cli.queries.diff import loaded
 from demandops.cli.table import CellOf, Column, Table, column, joined, table_of
 from demandops.cli.target import name_options, names_of, state_repo_option
+from demandops.decide.bookkeeping import bookkeeping, carried_topics
+from demandops.decide.override_report import override_report, override_state
 from demandops.model.config.base_model import duration_text, parse_time, relative
 from demandops.model.config.policy import matches
 from demandops.model.config.repo_settings import Proposals
@@ -40,8 +42,6 @@ from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.views import demand_lists, release_causes
-from demandops.views.bookkeeping import bookkeeping, carried_topics
-from demandops.views.release_causes import override_report, override_state
 
 # ---- the kinds of things: their data, columns and filters ----
 

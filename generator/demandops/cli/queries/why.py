@@ -12,11 +12,19 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli import json_output
-from demandops.cli.json_output import Json, commit_data, override_data, release_data, time_text
+from demandops.cli.json_output import (
+    Json,
+    commit_data,
+    decision_text,
+    override_data,
+    release_data,
+    time_text,
+)
 from demandops.cli.output import at_option, busy
 from demandops.cli.queries.diff import loaded
 from demandops.cli.queries.get import effect_words
 from demandops.cli.target import names_of, state_repo_option
+from demandops.decide.override_report import affected_releases, override_report
 from demandops.decide.planning.overrides import suspended_by, without_suspended
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.base_model import duration_text
@@ -33,7 +41,6 @@ from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.views import release_causes
 from demandops.views.demand_lists import nodes_of
-from demandops.views.release_causes import affected_releases, override_report
 
 # ---- the object that has the given name ----
 
@@ -302,6 +309,8 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
     yield f"  {entry['commit'][:10]} {when}  {word}, {entry['author']}: {entry['summary']}"
     if why and entry["why"]:
         yield f"    {entry['why']}"
+    if entry["decision"]:
+        yield f"    {decision_text(entry['decision'])}"
     for each in entry["carries_out"]:
         yield f"    carries out commit {each['commit'][:10]} of {each['author']}: {each['summary']}"
 

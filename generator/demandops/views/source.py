@@ -1,30 +1,34 @@
-"""What the page shows: the state at a commit, the health of releases and the open proposals."""
+"""The source of every view: the state at a commit, the health of releases, open proposals."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from functools import cached_property
-from typing import Any
+from typing import Any, Generic, TypeVar
 
+from demandops.base.errors import DemandOpsError
 from demandops.base.naming import Subject, SubjectKind
+from demandops.base.runtime import REAL
 from demandops.cluster import rollouts
 from demandops.cluster.health import Health, Target
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
+from demandops.decide.override_report import Entry, override_report, override_state
 from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import denied_release, plan
 from demandops.decide.planning.release_keys import ReleaseKey
+from demandops.decide.state import State
+from demandops.model.config.config import Config
 from demandops.model.config.override import Override
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World, changes_on
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.snapshot import Problem, Snapshot
+from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
 from demandops.views import release_causes
-from demandops.views.release_causes import Entry, override_report
 
 # ---- the health of a release in one word ----
 
@@ -65,6 +69,7 @@ def worst_word(statuses: Iterable[ReleaseStatus]) -> str:
 # ---- the state at one commit, and with it what the clusters report ----
 
 _UNKNOWN = ReleaseStatus(Health("waiting"))
+_Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,35 +79,60 @@ class Planned:
     claims: list[Claim]  # that need the release
 
 
-class CommitState:
-    def __init__(
-        self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem, ...], remedy: str = ""
-    ) -> None:
-        # ``remedy`` tells how to mend a configuration that is not in effect
-        self.snapshot, self.entry, self.problems, self.remedy = snapshot, entry, problems, remedy
-        self.commit, self.state = str(snapshot.commit), snapshot.state
-        self.config = snapshot.state.config
-        # For each list that was shown, by its name: the status of each release when the rows were
-        # made, or None if they are of an earlier commit; and the values and the row of each entry.
-        self.rows: dict[str, tuple[object, Mapping[str, tuple[tuple[Any, ...], Any]]]] = {}
-        self._entries: list[Entry] | None = None
-        # The newest commit that changed a path; None if none did. Paths are looked up when asked
-        # for, because each look-up walks through the history.
-        self.last_changes: dict[str, LogEntry | None] = {}
-        # The files that a generator must still write or remove; None until they are looked up.
-        self.not_rendered: frozenset[str] | None = None
+class _Derived(Generic[_Value]):
+    """A property that is computed once for a commit, whatever the clusters report meanwhile."""
 
-    @cached_property
-    def active(self) -> World:
-        return without_suspended(self.state)
+    def __init__(self, compute: Callable[[Source], _Value]) -> None:
+        self._compute, self._name = compute, compute.__name__
 
-    def take_over(self, before: CommitState) -> None:
-        # Its releases and rows are kept, and what may differ is planned anew. To be called before
-        # any other method, because computed attributes are kept.
+    def __get__(self, source: Source, owner: type[Source]) -> _Value:
+        if self._name not in source.derived:
+            source.derived[self._name] = self._compute(source)
+        value: _Value = source.derived[self._name]
+        return value
+
+
+@dataclass(frozen=True)
+class Source:
+    """What every view reads: the state at a commit, and what is known about it ``now``.
+
+    For an earlier commit, all that the clusters report is empty, as it is if none was asked.
+    """
+
+    snapshot: Snapshot = field(compare=False)
+    entry: LogEntry  # the commit
+    now: datetime
+    # Returns a reader for the calling thread.
+    reader: Callable[[], Reader] = field(compare=False)
+    problems: tuple[Problem, ...] = ()
+    remedy: str = ""  # how to mend a configuration that is not in effect
+    is_newest: bool = True
+    statuses: Mapping[str, ReleaseStatus] = field(default_factory=dict)
+    watched: frozenset[str] = frozenset()  # clusters
+    proposals: tuple[PendingProposal, ...] = ()
+    unread: str = ""  # why a newer state cannot be read or shown
+    push_denied: str = ""  # why the node that shows the page cannot publish demands
+    old_bootstraps: tuple[OldBootstrap, ...] = ()
+    orphans: tuple[Orphan, ...] = ()
+    # What follows from the commit alone. Sources of one commit share it.
+    derived: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
+
+    @classmethod
+    def read(cls, reader: Reader, snapshot: Snapshot, **more: Any) -> Source:  # noqa: ANN401
+        entry = next(reader.log(str(snapshot.commit)))
+        problems, remedy = reader.problems_of(snapshot), reader.how_to_mend(snapshot)
+        own = reader.for_another_thread
+        return cls(snapshot, entry, REAL.now(), own, problems, remedy, **more)
+
+    def taking_over(self, before: Source) -> Source:
+        """Plan only what may differ from an earlier source; its other releases and rows are kept.
+
+        To be called before anything is derived.
+        """
         old, new = before.state, self.state
         # another configuration, or another override, may change every release
         if (old.config, old.overrides) != (new.config, new.overrides):
-            return
+            return self
         # ledgers share the collection of an unchanged subject's claims, so comparing ids is enough
         subject_before = {id(claims): subject for subject, claims in old.ledger.claims.items()}
         subject_now = {id(claims): subject for subject, claims in new.ledger.claims.items()}
@@ -111,7 +141,7 @@ class CommitState:
         changes = changes_on(old.ledger, new.ledger, subjects)
         keys: set[ReleaseKey] = {*release_keys.affected_keys(old, new, changes)}
         for was, now in ((change.before, change.after) for change in changes):
-            # the page shows requesters, but `affected_keys` omits a release whose file stays the
+            # the views show requesters, but `affected_keys` omits a release whose file stays the
             # same although its requesters changed
             if was and now and was.requesters != now.requesters:
                 keys.update(release_keys.keys_of_claims(self.active, [now]))
@@ -120,16 +150,17 @@ class CommitState:
             planned.pop(key, None)
             if (release := self._plan(key)) or denied_release(new, key):
                 planned[key] = release
-        self.planned = planned
-        self.rows = {name: (None, rows) for name, (_, rows) in before.rows.items()}
+        self.derived["planned"] = planned
+        self.rows.update((name, (None, rows)) for name, (_, rows) in before.rows.items())
+        return self
 
     def _with_other_claims(
-        self, before: CommitState, subjects: Iterable[Subject]
+        self, before: Source, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
         for subject in subjects:
-            was, now = (state.active.ledger.claims_on(subject) for state in (before, self))
+            was, now = (source.active.ledger.claims_on(subject) for source in (before, self))
             gone |= {id(claim) for claim in was} - {id(claim) for claim in now}
             before_ids = {id(claim) for claim in was}
             fresh[subject.kind][subject.id] = [
@@ -151,47 +182,81 @@ class CommitState:
             if needing or len(kept) < len(planned.claims):
                 yield key, replace(planned, claims=release_causes.by_booking([*kept, *needing]))
 
+    @property
+    def commit(self) -> str:
+        return str(self.snapshot.commit)
+
+    @property
+    def state(self) -> State:
+        return self.snapshot.state
+
+    @property
+    def config(self) -> Config:
+        return self.snapshot.state.config
+
+    @_Derived
+    def active(self) -> World:
+        return without_suspended(self.state)
+
+    @_Derived
+    def rows(self) -> dict[str, tuple[object, Mapping[str, tuple[tuple[Any, ...], Any]]]]:
+        # For each list that was shown, by its name: the status of each release when the rows were
+        # made, or None if they are of an earlier commit; and the values and the row of each entry.
+        return {}
+
     def _plan(self, key: ReleaseKey) -> Planned | None:
         if (release := plan(self.state, key)) is None:
             return None
         target = rollouts.target_of(release, self.config.repo_settings)
         return Planned(release, target, release_causes.claims_behind(self.active.ledger, release))
 
-    @cached_property
+    @_Derived
     def planned(self) -> dict[ReleaseKey, Planned | None]:
         # None if the release is denied, if all claims that need it are suspended, or if the client
         # of a connection carries no topic
         return {key: self._plan(key) for key in release_keys.all_keys(self.state)}
 
-    @cached_property
-    def _sorted(self) -> list[Planned]:
+    @_Derived
+    def running(self) -> list[Planned]:
         running = filter(None, self.planned.values())
         return sorted(running, key=lambda each: (each.target.domain.cluster, each.target.name))
 
-    @cached_property
+    @_Derived
     def targets(self) -> list[tuple[Release, Target]]:
-        return [(planned.release, planned.target) for planned in self._sorted]
+        return [(planned.release, planned.target) for planned in self.running]
 
-    @cached_property
+    @_Derived
     def denied(self) -> list[tuple[Release, Override]]:
         keys = (key for key, planned in self.planned.items() if planned is None)
         return [denied for key in keys if (denied := denied_release(self.state, key))]
 
-    @cached_property
+    @_Derived
     def releases(self) -> dict[str, Release]:
         return {release.name: release for release, _ in self.targets}
 
-    def override_entries(self, now: datetime) -> list[Entry]:
-        # only the first call computes the report, so its `now` decides which overrides have expired
-        if self._entries is None:
-            self._entries = override_report(self.state, now)
-        return self._entries
+    @_Derived
+    def overrides(self) -> list[Entry]:
+        return [
+            replace(entry, state=override_state(entry, self.state, self.not_rendered))
+            for entry in override_report(self.state, self.now)
+        ]
 
-    @cached_property
+    @property
+    def not_rendered(self) -> frozenset[str]:
+        """The files that a generator has yet to write or remove, after a person's commit."""
+        if "not_rendered" not in self.derived:
+            try:
+                self.derived["not_rendered"] = self.reader().not_rendered(self.snapshot)
+            except DemandOpsError:  # the state repo is away, which the views tell
+                return frozenset()
+        found: frozenset[str] = self.derived["not_rendered"]
+        return found
+
+    @_Derived
     def claims_of_releases(self) -> dict[str, list[Claim]]:
-        return {planned.target.name: planned.claims for planned in self._sorted}
+        return {planned.target.name: planned.claims for planned in self.running}
 
-    @cached_property
+    @_Derived
     def releases_of_demands(self) -> dict[str, list[str]]:
         releases: dict[str, list[str]] = {}
         for name, claims in self.claims_of_releases.items():
@@ -199,7 +264,7 @@ class CommitState:
                 releases.setdefault(demand, []).append(name)
         return releases
 
-    @cached_property
+    @_Derived
     def claims_of_demands(self) -> dict[str, list[Claim]]:
         claims_of: dict[str, list[Claim]] = {}
         for claim in self.state.ledger:
@@ -209,27 +274,23 @@ class CommitState:
                 claims.sort(key=lambda claim: str(claim.subject))
         return claims_of
 
+    @_Derived
+    def _last_changes(self) -> dict[str, LogEntry | None]:
+        return {}
 
-@dataclass(frozen=True, slots=True)
-class Situation:
-    # for an earlier commit, all that the clusters report is empty
-    commit_state: CommitState
-    now: datetime
-    is_newest: bool = True
-    statuses: Mapping[str, ReleaseStatus] = field(default_factory=dict)
-    watched: frozenset[str] = frozenset()  # clusters
-    proposals: tuple[PendingProposal, ...] = ()
-    unread: str = ""  # why a newer state cannot be read or shown
-    push_denied: str = ""  # why the node that shows the page cannot publish demands
-    old_bootstraps: tuple[OldBootstrap, ...] = ()
-    orphans: tuple[Orphan, ...] = ()
+    def last_change(self, path: str) -> LogEntry | None:
+        """Return the newest commit that changed a path; each look-up walks through the history."""
+        if path not in self._last_changes:
+            changes = self.reader().log(self.commit, path) if path else iter(())
+            self._last_changes[path] = next(changes, None)
+        return self._last_changes[path]
 
     def status(self, release: str) -> ReleaseStatus:
         return self.statuses.get(release, _UNKNOWN)
 
     @property
     def unwatched(self) -> list[str]:
-        used = {target.domain.cluster for _, target in self.commit_state.targets}
+        used = {target.domain.cluster for _, target in self.targets}
         return sorted(used - self.watched)
 
 
@@ -240,8 +301,6 @@ class HealthChange:
     before: str  # a word of `WORDS`, as `after` is
     after: str
     reason: str = ""
-    # For a release that became healthy: how long the page saw that it was not.
-    lasted_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

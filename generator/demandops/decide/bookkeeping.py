@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from demandops.base.naming import Subject, SubjectKind
+from demandops.base.quantities import amount_text
 from demandops.decide.placement.capacity import whole_usage
 from demandops.decide.planning.overrides import suspended_claims, without_suspended
-from demandops.decide.planning.planner import connection_topics, demanded_inputs
-from demandops.model.config.inventory import amount_text
+from demandops.decide.planning.planner import connection_topics, demanded_inputs, plan
+from demandops.decide.planning.release_keys import all_keys
 from demandops.model.ledger.claim import Claim, requesters_of
-from demandops.model.ledger.ledger import World
+from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.ledger.records import in_turn
 from demandops.model.release import ServiceRelease, claims_of
-from demandops.views import release_causes
 
 # those that the plain data lacks if they are empty
 _LEFT_OUT = ("demands", "suspended", "nodes", "waiting", "targets", "listed")
@@ -31,7 +31,7 @@ Json: TypeAlias = dict[str, Any]
 def bookkeeping(world: World) -> Json:
     active = without_suspended(world)
     services, connections = dict[str, Json](), dict[str, Json]()
-    for release in release_causes.releases(world):
+    for release in (plan(world, key) for key in all_keys(world)):
         if not isinstance(release, ServiceRelease):
             continue
         inputs = {
@@ -50,7 +50,7 @@ def bookkeeping(world: World) -> Json:
             "source_topic": release.key.topic,
             "version": release.chart.version,
             "application_version": release.version.name or None,  # in registry/versions.yaml
-            "versions_asked": release_causes.versions_asked(release, active.ledger),
+            "versions_asked": versions_asked(release, active.ledger),
             "parameters": dict(release.parameters),
             "inputs": {role: _sorted(topics) for role, topics in inputs.items()},
             "requesters": list(release.requesters),
@@ -108,6 +108,14 @@ def bookkeeping(world: World) -> Json:
         "nodes": _nodes(world),
         "waiting": waiting,  # in the order of the tries to book
     }
+
+
+def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
+    asking: dict[str, set[str]] = {}
+    for claim in claims_of(release, ledger):
+        if claim.application.version:
+            asking.setdefault(claim.application.version, set()).update(claim.requesters)
+    return {version: sorted(requesters) for version, requesters in sorted(asking.items())}
 
 
 def _demands(world: World) -> dict[str, Json]:
