@@ -15,14 +15,13 @@ from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
 from demandops.cli import target
-from demandops.cli.authoring.scaffold import document
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import Options, changing, propose_option, writable
 from demandops.cli.json_output import Json, override_data
 from demandops.cli.output import read_by
 from demandops.cli.target import names_of
 from demandops.decide.state import State
-from demandops.model.config.base_model import parse_file, parse_time, seconds_of
+from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.config.policy import matches
