@@ -148,10 +148,11 @@ def reject(
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Reject a proposal: record that on main in your own name, and delete its branch.
+    """Reject a proposal in your own name, and delete its branch.
 
-    The requester gets the reason; the generator aborts the goal with `turned-down`. If the branch
-    has changed since the command read it, the command changes nothing.
+    A commit on main records it, and the requester gets the reason; the generator aborts the goal
+    with `turned-down`. If the branch has changed since the command read it, the command changes
+    nothing.
 
     \b
     Examples:
