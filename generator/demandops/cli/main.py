@@ -48,10 +48,11 @@ COMMANDS = {
         "demandops_ros.parameter_sync",
         "Keep a ROS node's parameters equal to those in a ConfigMap.",
     ),
-    "reject": (
-        "changes.approve",
-        "Reject a proposal in your own name, and delete its branch.",
+    "release": (
+        "changes.ledger_change",
+        "Stop one demand, or an application for all who demand it.",
     ),
+    "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),
     "request": ("changes.request", "Book demand requests from files."),
     "resume": ("changes.override", "Run suspended applications and connections again."),
     "rollback": (
@@ -119,12 +120,11 @@ class _LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         name, command, arguments = super().resolve_command(ctx, args)
-        if name is None:
-            return name, command, arguments
-        command = load(name)
-        if name not in _LONG_RUNNING and "demandops.repo.git.remote_repository" in sys.modules:
-            import_module("demandops.repo.git.remote_repository").listen(show_slow)
-        return name, command, arguments
+        if name and name not in _LONG_RUNNING:
+            from demandops.repo.git import remote_repository  # noqa: PLC0415 - it imports pygit2
+
+            remote_repository.listen(show_slow)
+        return name, load(name) if name else command, arguments
 
 
 @click.group(

@@ -7,8 +7,8 @@ so none is behind a card.
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -17,38 +17,37 @@ from demandops.model.release import ServiceRelease
 from demandops.views.source import RANKS, WORDS, Source, word_of
 from demandops.web.lists import Filter, Row, exactly, rows_of
 
-# A drawing for wide screens and one for phones, of which the style sheet shows one: its width, and
-# above how many nodes of a type these are drawn as stacks.
-_DRAWINGS = {"wide": (1200.0, 40), "narrow": (340.0, 12)}
-_TYPES = ("cloud", "edge", "station", "vehicle")
-_WORST = ("bad", "busy", "none", "good", "empty")
-
+# A drawing for wide screens and one for phones, of which the style sheet shows one: its width, the
+# widths of its large and of its small cards, the least gap between them, and above how many nodes
+# of a type these are drawn as stacks.
+_DRAWINGS = {"wide": (1200.0, 212.0, 144.0, 20.0, 40), "narrow": (340.0, 156.0, 102.0, 8.0, 12)}
 # The same for nodes that have nothing to do with what a filter finds.
 _FEW_CARDS = 4
-# Up to how many cards are large enough to list services by their names.
-_MOST_DETAILED = 16
-_MOST_SERVICES = 5
+# Up to how many cards are large, so that they list releases by their names, and how many of these.
+_MOST_LARGE, _MOST_LISTED = 16, 5
 # Without a filter, more lines than this would say nothing; then only those not ready are drawn.
 _MOST_LINES = 150
 # By position, the map has so many columns and rows; nodes of one cell form a stack if there are
 # too many to draw each.
 _CELLS = 6
 _CHANNEL = 44.0  # the free height between two rows of cards
-_LINE = 15.0
+
+_TYPES = ("cloud", "edge", "station", "vehicle")  # from top to bottom, other types below
+_WORST_FIRST = ("bad", "busy", "none", "good", "empty")
 
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A release on a node's card, or a node on a stack's."""
+    """A release on the card of a node, or a node on the card of a stack."""
 
     text: str
     tone: str
-    is_main: bool  # no client of a connection
+    is_service: bool
     is_lit: bool
 
 
-def tone_of(marks: Iterable[Mark]) -> str:
-    return min((mark.tone for mark in marks), key=_WORST.index, default="empty")
+def _tone(marks: Iterable[Mark]) -> str:
+    return min((mark.tone for mark in marks), key=_WORST_FIRST.index, default="empty")
 
 
 @dataclass(slots=True)
@@ -57,20 +56,29 @@ class Card:
     is_lit: bool
     query: str  # the filter that chooses these nodes
     marks: list[Mark]
+    tone: str
     x: float = 0.0
     y: float = 0.0
     width: float = 0.0
     height: float = 0.0
     row: int = 0
-    is_detailed: bool = False
+    is_large: bool = False
 
     @property
     def is_stack(self) -> bool:
         return len(self.nodes) > 1
 
     @property
-    def tone(self) -> str:
-        return tone_of(self.marks)
+    def is_drained(self) -> bool:
+        return all(node.drained for node in self.nodes)
+
+    @property
+    def middle(self) -> float:
+        return self.x + self.width / 2
+
+    @property
+    def bottom(self) -> float:
+        return self.y + self.height
 
     @property
     def label(self) -> str:
@@ -80,29 +88,34 @@ class Card:
         return f"{len(self.nodes)} {types.pop() if len(types) == 1 else 'node'}s"
 
     @property
-    def is_drained(self) -> bool:
-        return all(node.drained for node in self.nodes)
-
-    @property
     def state(self) -> str:
         late = sum(mark.tone in ("bad", "busy") for mark in self.marks)
         words = [f"{late} not ready"] if late else []
         words += [] if self.is_stack else [self.nodes[0].type]
         words += ["drained"] if self.is_drained else []
-        words += [] if any(mark.tone != "empty" for mark in self.marks) else ["unused"]
+        words += ["unused"] if self.tone == "empty" else []
         return ", ".join(words)
 
     @property
     def title(self) -> str:
+        releases = [] if self.is_stack else [f"{len(self.marks)} releases"]
         clusters = ", ".join(sorted({node.cluster for node in self.nodes}))
-        parts = [self.state, f"cluster {clusters}"]
-        if not self.is_stack:
-            parts.append(f"{len(self.marks)} releases")
-        return f"{self.label}: {', '.join(filter(None, parts))}"
+        return f"{self.label}: {', '.join([self.state, *releases, f'cluster {clusters}'])}"
 
     def short(self, text: str) -> str:
         most = int((self.width - 26) / 6.4)
         return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A connection, as the map shows it."""
+
+    ends: tuple[str, ...]  # its nodes
+    name: str
+    topics: int
+    word: str  # its health
+    is_lit: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,75 +127,59 @@ class Line:
     title: str
 
 
-@dataclass(slots=True)
-class Drawing:
-    name: str
-    width: float
-    height: float = 0.0
-    cards: list[Card] = field(default_factory=list)
-    lines: list[Line] = field(default_factory=list)
-    is_cut: bool = False  # lines are left out
-
-
 def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     # A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a
-    # position, and some are not in one row.
-    config = source.config
-    nodes = sorted(config.nodes.values(), key=lambda node: (node.cluster, node.id))
-    layouts = ("cluster", "place") if any(node.position for node in nodes) else ("cluster",)
-    if layout not in layouts:
-        is_placed = sum(node.position is not None for node in nodes) > len(nodes) / 2
-        layout = "place" if is_placed else "cluster"
-
-    connections = [
-        row
-        for row in rows_of(source, "connections")
-        if config.nodes.keys() >= {*row.hidden["node"]}
-    ]
-    peers: dict[str, set[str]] = defaultdict(set)
-    for row in connections:
-        one, other = row.hidden["node"]
-        peers[one].add(other)
-        peers[other].add(one)
-
-    matching: list[Row] = []
-    if wanted:
-        matching = [*filter(wanted.matches, (*rows_of(source, "services"), *connections))]
-    lit_releases = {part.text for row in matching for part in row.cells["release"].parts}
-    marks: dict[str, list[Mark]] = {id: [] for id in config.nodes}
-    for release, _ in source.targets:
-        if release.node.id in marks:
-            is_service = isinstance(release, ServiceRelease)
-            if isinstance(release, ServiceRelease):
-                text = " · ".join(filter(None, (release.key.service, release.key.source)))
-            else:
-                text = f"{release.type.word} {', '.join(release.connections)}"
-            tone = WORDS[word_of(source.status(release.name))]
-            mark = Mark(text, tone, is_service, release.name in lit_releases)
-            marks[release.node.id].append(mark)
-
+    # position.
+    known = source.config.nodes
+    nodes = sorted(known.values(), key=lambda node: (node.cluster, node.id))
     spots = _spots(nodes)
-    # a node is lit if it matches, or a service or connection that it has
-    chosen, lit = set[str](), {id for row in matching for id in _nodes_of(row)}
+    layouts = ("cluster", "place") if spots else ("cluster",)
+    if layout not in layouts:
+        layout = "place" if len(spots) > len(nodes) / 2 else "cluster"
+
+    lit, lit_releases = set[str](), set[str]()  # a node is lit with a service or connection of it
+    links, peers = list[Link](), defaultdict[str, set[str]](set)
+    for row in rows_of(source, "connections"):
+        if known.keys() >= {*(ends := tuple(row.hidden["node"]))}:
+            is_lit = bool(wanted) and wanted.matches(row)
+            word, topics = row.cells["health"].parts[0].text, len(row.cells["topic"].parts)
+            links.append(Link(ends, row.cells["connection"].parts[0].text, topics, word, is_lit))
+            peers[ends[0]].add(ends[1])
+            peers[ends[1]].add(ends[0])
+            if is_lit:
+                lit.update(ends)
+                lit_releases.update(part.text for part in row.cells["release"].parts)
+    for row in rows_of(source, "services") if wanted else ():
+        if wanted.matches(row):
+            lit.update(part.text for part in row.cells["node"].parts)
+            lit_releases.update(part.text for part in row.cells["release"].parts)
+    marks: dict[str, list[Mark]] = {id: [] for id in known}
+    for release, _ in source.targets:
+        if release.node.id not in marks:
+            continue
+        text = (
+            " · ".join(filter(None, (release.key.service, release.key.source)))
+            if isinstance(release, ServiceRelease)
+            else f"{release.type.word} {', '.join(release.connections)}"
+        )
+        tone, is_lit = WORDS[word_of(source.status(release.name))], release.name in lit_releases
+        marks[release.node.id].append(Mark(text, tone, isinstance(release, ServiceRelease), is_lit))
+    chosen = set[str]()
     for node in nodes if wanted else ():
         texts = {"node": [node.id], "type": [node.type], "cluster": [node.cluster]}
-        texts |= {"peer": sorted(peers[node.id]) or ["none"]}
+        texts["peer"] = sorted(peers[node.id]) or ["none"]
         texts["cell"] = [_cell(spots[node.id])] if node.id in spots else []
         if wanted.matches(Row({}, texts)):
             chosen.add(node.id)
-    lit = (lit | chosen) & marks.keys()
+    lit = (lit | chosen) & known.keys()
 
-    if layout == "cluster":
-        spots = {}
     drawings = []
-    for name, (width, most) in _DRAWINGS.items():
-        drawing = Drawing(name, width)
-        drawing.cards = [
-            _card(group, query, marks, lit)
-            for group, query in _groups(nodes, peers, lit, spots, most)
-        ]
-        _place(drawing, peers, spots)
-        _draw_lines(drawing, connections, chosen, matching, is_filtered=bool(wanted))
+    for name, (width, large, small, gap, most) in _DRAWINGS.items():
+        used_spots = spots if layout == "place" else {}
+        groups = _groups(nodes, peers, lit, used_spots, most)
+        drawing = Drawing(name, width, [_card(*group, marks, lit) for group in groups])
+        drawing.place(large if len(drawing.cards) <= _MOST_LARGE else small, gap, peers, used_spots)
+        drawing.connect(links, chosen, is_filtered=bool(wanted))
         drawings.append(drawing)
     return {
         "drawings": drawings,
@@ -196,10 +193,6 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     }
 
 
-def _nodes_of(row: Row) -> Iterable[str]:
-    return row.hidden.get("node") or [part.text for part in row.cells["node"].parts]
-
-
 # ---- which nodes stand together ----
 
 # Where a node is on the map: from 0 to 1, from west to east and from north to south.
@@ -208,220 +201,191 @@ Spot = tuple[float, float]
 
 def _spots(nodes: Iterable[Node]) -> dict[str, Spot]:
     positions = {node.id: node.position for node in nodes if node.position}
-    if not positions:
-        return {}
-    xs, ys = [each.x for each in positions.values()], [each.y for each in positions.values()]
+    xs, ys = ([getattr(each, axis) for each in positions.values()] or [0.0] for axis in "xy")
     # one scale for both directions, so that distances can be compared; the map is a wide one
     wide, high = max(xs) - min(xs), max(ys) - min(ys)
     span = max(wide, 2 * high, 1.0)
+    left, top = min(xs) - (span - wide) / 2, max(ys) + (span / 2 - high) / 2
     return {
-        id: (
-            (each.x - min(xs) + (span - wide) / 2) / span,
-            (max(ys) - each.y + (span / 2 - high) / 2) / (span / 2),
-        )
-        for id, each in positions.items()
+        id: ((each.x - left) / span, (top - each.y) / (span / 2)) for id, each in positions.items()
     }
 
 
+def _step(part: float) -> int:
+    return min(int(part * _CELLS), _CELLS - 1)
+
+
 def _cell(spot: Spot) -> str:
-    return "/".join(str(min(int(part * _CELLS), _CELLS - 1)) for part in spot)
+    return "/".join(str(_step(part)) for part in spot)
 
 
 def _groups(
-    nodes: list[Node],
+    nodes: Iterable[Node],
     peers: Mapping[str, set[str]],
     lit: set[str],
     spots: Mapping[str, Spot],
     most: int,
-) -> Iterable[tuple[list[Node], str]]:
+) -> Iterator[tuple[list[Node], str]]:
     """Yield the nodes of each card, with the filter that chooses them.
 
     If there are too many nodes of a type, those that are connected with the same nodes form a
     stack: the vehicles of an edge. If there are still too many, those of a cluster do; else all do.
+    By position, those in one part of the map do.
     """
     near = {peer for id in lit for peer in peers[id]}
-    alike: dict[tuple[str, bool, bool], list[Node]] = {}
+    alike: dict[tuple[str, bool, bool, bool], list[Node]] = {}
     for node in nodes:
-        kind = "" if node.id in spots else node.type, node.id in lit, node.id in near
+        kind = node.type, node.id in spots, node.id in lit, node.id in near
         alike.setdefault(kind, []).append(node)
-    for (type, *is_chosen), same in alike.items():
-        # with a filter, nodes that have nothing to do with what it finds may take little room
-        is_aside = bool(lit) and not any(is_chosen) and len(nodes) > most
+    for (_, is_placed, *is_found), same in alike.items():
+        # with a filter, nodes that have nothing to do with what it finds take little room
+        is_aside = bool(lit) and not any(is_found) and sum(map(len, alike.values())) > most
         stacks: dict[str, list[Node]] = {exactly("node", node.id): [node] for node in same}
-        for level in (3, 2, 1) if type else (0,):
+        for level in (2,) if is_placed else (3, 2, 1):
             if len(stacks) <= (_FEW_CARDS if is_aside else most):
                 break
             stacks = {}
             for node in same:
-                ids = sorted(peers[node.id]) or ["none"]
-                joined = " ".join(exactly("peer", id) for id in ids)
-                parts = (exactly("type", node.type), exactly("cluster", node.cluster), joined)
-                query = " ".join(parts[:level]) or exactly("cell", _cell(spots[node.id]))
+                parts = [exactly("type", node.type), exactly("cluster", node.cluster)]
+                parts += [exactly("peer", id) for id in sorted(peers[node.id]) or ["none"]]
+                if is_placed:
+                    parts[1] = exactly("cell", _cell(spots[node.id]))
+                query = " ".join(parts[: level if level < 3 else None])
                 stacks.setdefault(query, []).append(node)
         for query, stack in stacks.items():
             yield stack, exactly("node", stack[0].id) if len(stack) == 1 else query
 
 
 def _card(nodes: list[Node], query: str, marks: Mapping[str, list[Mark]], lit: set[str]) -> Card:
-    card = Card(nodes, nodes[0].id in lit, query, marks[nodes[0].id])
-    if card.is_stack:
-        card.marks = [Mark(id, tone_of(marks[id]), True, False) for id in (n.id for n in nodes)]
+    own = marks[nodes[0].id]
+    if len(nodes) > 1:
+        own = [Mark(node.id, _tone(marks[node.id]), True, False) for node in nodes]
     # where nothing is lit by itself, all is lit with the card
-    is_some_lit = any(mark.is_lit for mark in card.marks)
-    card.marks = sorted(
-        (replace(mark, is_lit=mark.is_lit or not is_some_lit) for mark in card.marks),
-        key=lambda mark: (not mark.is_lit, _WORST.index(mark.tone), not mark.is_main, mark.text),
+    is_some_lit = any(mark.is_lit for mark in own)
+    own = sorted(
+        (replace(mark, is_lit=mark.is_lit or not is_some_lit) for mark in own),
+        key=lambda m: (not m.is_lit, _WORST_FIRST.index(m.tone), not m.is_service, m.text),
     )
-    return card
+    return Card(nodes, nodes[0].id in lit, query, own, _tone(own))
 
 
-# ---- where the cards stand ----
+# ---- the drawing: where the cards stand, and the lines between them ----
 
 
-def _place(drawing: Drawing, peers: Mapping[str, set[str]], spots: Mapping[str, Spot]) -> None:
-    cards, width = drawing.cards, drawing.width
-    is_detailed = len(cards) <= _MOST_DETAILED
-    is_wide = width > 600
-    across = (212.0 if is_detailed else 144.0) if is_wide else (156.0 if is_detailed else 102.0)
-    gap = 20.0 if is_wide else 8.0
-    for card in cards:
-        card.width, card.height, card.is_detailed = across, 58.0, is_detailed and not card.is_stack
-        if card.is_detailed:
-            lines = min(len(card.marks), _MOST_SERVICES) + (len(card.marks) > _MOST_SERVICES)
-            card.height = 44.0 + _LINE * lines
-    rows: dict[tuple[int, int, str], list[Card]] = {}
-    for card in cards:
-        kind = card.nodes[0].type
-        place = _TYPES.index(kind) if kind in _TYPES else len(_TYPES)
-        key = 1, place, kind
-        if card.nodes[0].id in spots:
-            key = 0, min(int(spots[card.nodes[0].id][1] * _CELLS), _CELLS - 1), ""
-        rows.setdefault(key, []).append(card)
-    columns = max(1, int((width - gap) // (across + gap)))
-    middle: dict[str, float] = {}  # of the card of each node that is placed
-    y, number = 4.0, 0
-    for key, row in sorted(rows.items()):
-        wishes: list[tuple[float, Card]] = []
-        for card in row:
-            if key[0] == 0:
-                wish = sum(spots[node.id][0] for node in card.nodes) / len(card.nodes) * width
-            else:  # below or above those that it is connected with
-                near = [middle[id] for node in card.nodes for id in peers[node.id] if id in middle]
-                wish = sum(near) / len(near) if near else width
-            wishes.append((wish, card))
-        wishes.sort(key=lambda pair: (round(pair[0]), pair[1].nodes[0].cluster, pair[1].label))
-        # A long row becomes several that all reach from left to right.
-        parts = -(-len(row) // columns)
-        for part in range(parts):
-            chosen = wishes[part::parts]
-            free = (width - across * len(chosen)) / (len(chosen) + 1)
-            end = gap - across
-            for place, (wish, card) in enumerate(chosen):
-                even = free * (place + 1) + across * place
-                card.x = (
-                    max(end + gap + across if place else gap, wish - across / 2)
-                    if (key[0] == 0)
-                    else even
-                )
-                end = card.x
-                card.y, card.row = y, number
-            limit = width - gap
-            for _, card in reversed(chosen):  # back from the right edge
-                card.x = min(card.x, limit - across)
-                limit = card.x - gap
-            middle |= {node.id: c.x + across / 2 for _, c in chosen for node in c.nodes}
-            y += max(card.height for _, card in chosen) + _CHANNEL
-            number += 1
-    drawing.height = max(y - _CHANNEL * 0.4, _CHANNEL)
+@dataclass(slots=True)
+class Gap:
+    """A gap between the cards of a row, from top to bottom; lines go through it."""
+
+    left: float
+    right: float
+    used: int = 0  # by how many lines
 
 
-# ---- the lines between them ----
+@dataclass(slots=True)
+class Drawing:
+    name: str
+    width: float
+    cards: list[Card]
+    height: float = 0.0
+    lines: list[Line] = field(default_factory=list)
+    is_cut: bool = False  # lines are left out
+    rows: list[tuple[float, float, list[Gap]]] = field(default_factory=list)  # top, bottom, gaps
 
+    def place(
+        self, across: float, gap: float, peers: Mapping[str, set[str]], spots: Mapping[str, Spot]
+    ) -> None:
+        def row_of(card: Card) -> tuple[bool, int, str]:
+            node = card.nodes[0]
+            if node.id in spots:
+                return False, _step(spots[node.id][1]), ""
+            return True, (*_TYPES, node.type).index(node.type), node.type
 
-def _draw_lines(
-    drawing: Drawing,
-    connections: Iterable[Row],
-    chosen: set[str],
-    matching: Iterable[Row],
-    *,
-    is_filtered: bool,
-) -> None:
-    lit_rows = {id(row) for row in matching}
-    card_of = {node.id: card for card in drawing.cards for node in card.nodes}
-    between: dict[tuple[int, int], list[Row]] = {}
-    ends: dict[tuple[int, int], tuple[Card, Card]] = {}
-    for row in connections:
-        pair = sorted(
-            map(card_of.__getitem__, row.hidden["node"]), key=lambda card: (card.row, card.x)
-        )
-        if pair[0] is not pair[1]:
-            key = id(pair[0]), id(pair[1])
-            ends[key] = pair[0], pair[1]
-            between.setdefault(key, []).append(row)
-    rows: dict[int, list[Card]] = defaultdict(list)
-    for card in drawing.cards:
-        rows[card.row].append(card)
-    used = Counter[tuple[int, float]]()
-    for key, carried in between.items():
-        upper, lower = ends[key]
-        is_lit = any(
-            id(row) in lit_rows or not chosen.isdisjoint(row.hidden["node"]) for row in carried
-        )
-        words = [row.cells["health"].parts[0].text for row in carried]
-        worst = min(words, key=RANKS.__getitem__)
-        is_late = WORDS[worst] in ("bad", "busy")
-        if is_filtered and not is_lit:
-            continue
-        if len(between) > _MOST_LINES and not (is_lit or is_late):
-            drawing.is_cut = True
-            continue
-        topics = sum(len(row.cells["topic"].parts) for row in carried)
-        names = ", ".join(row.cells["connection"].parts[0].text for row in carried[:3])
-        more = f" and {len(carried) - 3} more" if len(carried) > 3 else ""
-        title = f"{upper.label} and {lower.label}: {names}{more}; {topics} topics; {worst}"
-        query = " ".join(
-            exactly("node", card.nodes[0].id) for card in (upper, lower) if not card.is_stack
-        )
-        path = _path(upper, lower, rows, drawing.width, used)
-        drawing.lines.append(Line(path, WORDS[worst], is_lit, query, title))
+        by_row: dict[tuple[bool, int, str], list[Card]] = {}
+        for card in self.cards:
+            listed = min(len(card.marks), _MOST_LISTED + 1)
+            card.is_large = len(self.cards) <= _MOST_LARGE and not card.is_stack
+            card.width, card.height = across, 44.0 + 15.0 * listed if card.is_large else 58.0
+            by_row.setdefault(row_of(card), []).append(card)
+        columns = max(1, int((self.width - gap) // (across + gap)))
+        middles: dict[str, float] = {}  # of the card of each node that is placed
+        y = 6.0
+        for (is_by_type, _, _), cards in sorted(by_row.items()):
+            wishes: dict[int, float] = {}
+            for card in cards:
+                if is_by_type:  # below those that it is connected with, else on the right
+                    above = [middles.get(id) for node in card.nodes for id in peers[node.id]]
+                    near = [middle for middle in above if middle is not None] or [self.width]
+                else:
+                    near = [spots[node.id][0] * self.width for node in card.nodes]
+                wishes[id(card)] = sum(near) / len(near)
+            cards.sort(key=lambda c: (round(wishes[id(c)]), c.nodes[0].cluster, c.label))
+            # A long row becomes several that all reach from left to right.
+            parts = -(-len(cards) // columns)
+            for row in (cards[part::parts] for part in range(parts)):
+                free, left, right = (self.width - across * len(row)) / (len(row) + 1), gap, 0.0
+                for place, card in enumerate(row):
+                    even = free * (place + 1) + across * place
+                    card.x = even if is_by_type else max(left, wishes[id(card)] - across / 2)
+                    card.y, card.row, left = y, len(self.rows), card.x + across + gap
+                right = self.width
+                for card in reversed(row):  # back from the right edge
+                    card.x = min(card.x, right - gap - across)
+                    right = card.x
+                middles |= {node.id: card.middle for card in row for node in card.nodes}
+                edges = [0.0, *(edge for c in row for edge in (c.x, c.x + across)), self.width]
+                gaps = [Gap(*sides) for sides in zip(edges[::2], edges[1::2], strict=True)]
+                self.rows.append((y, max(card.bottom for card in row), gaps))
+                y = self.rows[-1][1] + _CHANNEL
+        self.height = y - _CHANNEL * 0.4
 
+    def connect(self, links: Iterable[Link], chosen: set[str], *, is_filtered: bool) -> None:
+        card_of = {node.id: card for card in self.cards for node in card.nodes}
+        between: dict[tuple[int, int], tuple[Card, Card, list[Link]]] = {}
+        for link in links:
+            ends = (card_of[id] for id in link.ends)
+            upper, lower = sorted(ends, key=lambda card: (card.row, card.x))
+            if upper is not lower:
+                pair = between.setdefault((id(upper), id(lower)), (upper, lower, []))
+                pair[2].append(link)
+        for upper, lower, carried in between.values():
+            is_lit = any(link.is_lit or not chosen.isdisjoint(link.ends) for link in carried)
+            worst = min((link.word for link in carried), key=RANKS.__getitem__)
+            if is_filtered and not is_lit:
+                continue
+            is_late = WORDS[worst] in ("bad", "busy")
+            if len(between) > _MOST_LINES and not (is_lit or is_late):
+                self.is_cut = True
+                continue
+            names = ", ".join(link.name for link in carried[:3])
+            names += f" and {len(carried) - 3} more" if len(carried) > 3 else ""
+            topics = sum(link.topics for link in carried)
+            title = f"{upper.label} and {lower.label}: {names}; {topics} topics; {worst}"
+            singles = [card for card in (upper, lower) if not card.is_stack]
+            query = " ".join(exactly("node", card.nodes[0].id) for card in singles)
+            line = Line(self._path(upper, lower), WORDS[worst], is_lit, query, title)
+            self.lines.append(line)
 
-def _path(
-    upper: Card,
-    lower: Card,
-    rows: Mapping[int, list[Card]],
-    width: float,
-    used: Counter[tuple[int, float]],
-) -> str:
-    """Return a path that goes down through the gaps between the cards of each row on its way."""
-    x, bottom = (
-        upper.x + upper.width / 2,
-        {number: max(card.y + card.height for card in row) for number, row in rows.items()},
-    )
-    end, y = lower.x + lower.width / 2, bottom[upper.row]
-    path = f"M{x:.1f} {upper.y + upper.height:.1f}V{y:.1f}"
-    if upper.row == lower.row:
-        deep = y + _CHANNEL * 0.7
-        path += f"C{x:.1f} {deep:.1f} {end:.1f} {deep:.1f} {end:.1f} {y:.1f}"
-        return f"{path}V{lower.y + lower.height:.1f}"
-    for number in range(upper.row + 1, lower.row + 1):
-        row = sorted(rows[number], key=lambda card: card.x)
-        top, to = row[0].y, end
-        if number < lower.row:
-            edges = [0.0, *(edge for card in row for edge in (card.x, card.x + card.width)), width]
-            gaps = [(left, right) for left, right in zip(edges[::2], edges[1::2], strict=True)]
-            wish = x + (end - x) / (lower.row - number + 1)
-            left, right = min(gaps, key=lambda gap: abs(min(max(wish, gap[0]), gap[1]) - wish))
-            free = right - left
-            if free > 40:  # a wide gap: near to the straight way
-                to = min(max(wish, left + 8), right - 8)
-            else:  # lines through a narrow one stand side by side
-                place = used[number, left] % 5 - 2
-                used[number, left] += 1
-                to = (left + right) / 2 + place * free / 8
-        half = (y + top) / 2
-        path += f"C{x:.1f} {half:.1f} {to:.1f} {half:.1f} {to:.1f} {top:.1f}"
-        if number < lower.row:
-            path += f"V{bottom[number]:.1f}"
-        x, y = to, bottom[number]
-    return path
+    def _path(self, upper: Card, lower: Card) -> str:
+        """Return a path that goes down through a gap between the cards of each row on its way."""
+        x, y, end = upper.middle, self.rows[upper.row][1], lower.middle
+        path = f"M{x:.1f} {upper.bottom:.1f}V{y:.1f}"
+        if upper.row == lower.row:  # in an arc below both
+            deep = y + _CHANNEL * 0.7
+            path += f"C{x:.1f} {deep:.1f} {end:.1f} {deep:.1f} {end:.1f} {y:.1f}"
+            return f"{path}V{lower.bottom:.1f}"
+        for number in range(upper.row + 1, lower.row + 1):
+            (top, bottom, gaps), to = self.rows[number], end
+            if number < lower.row:
+                straight = x + (end - x) / (lower.row - number + 1)
+                gap = min(gaps, key=lambda gap: max(gap.left - straight, straight - gap.right))
+                free = gap.right - gap.left
+                if free > 40:
+                    to = min(max(straight, gap.left + 8), gap.right - 8)
+                else:  # lines through a narrow gap stand side by side
+                    to = (gap.left + gap.right) / 2 + (gap.used % 5 - 2) * free / 8
+                    gap.used += 1
+            half = (y + top) / 2
+            path += f"C{x:.1f} {half:.1f} {to:.1f} {half:.1f} {to:.1f} {top:.1f}"
+            path += f"V{bottom:.1f}" if number < lower.row else ""
+            x, y = to, bottom
+        return path

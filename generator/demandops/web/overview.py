@@ -35,7 +35,7 @@ def figures(source: Source, wanted: Filter, events: Iterable[Event], now: dateti
             (Part(f"{count} {word}", view, {"q": exactly("health", word)}), tone)
             for (_, word, tone), count in sorted(counts.items())
         ]
-        return Figure(len(rows), Part(what, view), words)
+        return Figure(len(rows), Part(_counted(len(rows), what), view), words)
 
     services, connections, demands = map(matching, ("services", "connections", "demands"))
     requesters = {part.text for row in demands for part in row.cells["requester"].parts}
@@ -57,20 +57,31 @@ def figures(source: Source, wanted: Filter, events: Iterable[Event], now: dateti
         return Part(f"{booked} booked, {released} released in the last {span}"), ""
 
     return [
-        of_list(services, "services", "services"),
-        of_list(connections, "connections", "connections"),
-        of_list(demands, "demands", "demands"),
-        Figure(len(requesters), Part("requesters", "demands", {"sort": "requester"})),
+        of_list(services, "service", "services"),
+        of_list(connections, "connection", "connections"),
+        of_list(demands, "demand", "demands"),
+        Figure(
+            len(requesters),
+            Part(_counted(len(requesters), "requester"), "demands", {"sort": "requester"}),
+        ),
         Figure(len(nodes), Part(f"of {len(source.config.nodes)} nodes used", "map")),
         Figure(
-            sum(count for count, _ in waits), Part("wait", "overrides"), [part for _, part in waits]
+            sum(count for count, _ in waits),
+            Part("waiting", "overrides"),
+            [part for _, part in waits],
         ),
         Figure(
             len(last_hour),
-            Part("changes in the last hour", "timeline", {"span": "1h"}),
+            Part(
+                f"{_counted(len(last_hour), 'change')} in the last hour", "timeline", {"span": "1h"}
+            ),
             [rate(last_hour, "hour"), rate(last_day, "day")],
         ),
     ]
+
+
+def _counted(count: int, word: str) -> str:
+    return word if count == 1 else f"{word}s"
 
 
 def newest(events: Sequence[Event]) -> Iterator[tuple[Event, int]]:
