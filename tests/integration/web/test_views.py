@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.base.errors import StateRepoError
 from demandops.cluster.health import Health
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
 from demandops.model.demand.goals import read_goal
@@ -20,7 +19,7 @@ from demandops.views.source import Source
 from demandops.web import fleet_map, time_line
 from demandops.web.follower import Follower
 from demandops.web.lists import Filter, page_of, rows_of
-from demandops.web.release_view import explained_demand
+from demandops.web.thing import thing
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes
@@ -118,9 +117,25 @@ def test_not_everything_is_ready_while_a_cluster_is_not_watched(
     assert "Whether pods run on c-its is unknown" in page.text
 
 
-def test_an_unknown_release_is_told_with_the_commit_that_was_searched(look: Look) -> None:
+def test_each_kind_of_thing_has_a_page(look: Look) -> None:
+    for kind, name, told in (
+        ("node", "edge", "in cluster c-its"),
+        ("requester", "station00", "vehicle01/edge"),
+        ("application", "edge/object_detection_fusion", DETECTION),
+        ("connection", "vehicle00/edge", "MQTT"),
+        ("appdef", "object-detection-fusion", "edge/object_detection_fusion"),
+        ("service", "object-detection", DETECTION),
+        ("domain", "perception", "namespace perception"),
+    ):
+        page = look("/thing", kind=kind, name=name)
+        assert page.texts("h1")[0].startswith(f"{kind.capitalize()} {name} ")
+        assert told in page.text, kind
+        assert page.texts("h2")[-1] == "Time line"
+
+
+def test_an_unknown_release_is_told(look: Look) -> None:
     page = look("/release", status=404, name="od-nowhere")
-    assert "there was no release 'od-nowhere'" in page.text
+    assert "no release is called 'od-nowhere'" in page.text
 
 
 def test_an_old_bootstrap_file_and_an_object_of_no_release_are_causes(follower: Follower) -> None:
@@ -274,8 +289,7 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     assert cause.why == "waits for room on a node"
     rows = [row for row in rows_of(now, "demands") if Filter("demand=later").matches(row)]
     assert [row.cells["health"].parts[0].text for row in rows] == ["waits for room"]
-    with pytest.raises(StateRepoError, match="'later' holds nothing, because it waits for room"):
-        explained_demand(now, follower.reader(), "later")
+    assert thing(now, "later", "demand", ())["word"] == "waiting"
 
 
 def test_the_time_line_fills_the_drawing(shown: Shown) -> None:
