@@ -20,7 +20,7 @@ from demandops.repo.merge_check.helm import (
     parsed_kinds,
     parsed_lint,
 )
-from demandops.repo.merge_check.rendered_charts import _Run
+from demandops.repo.merge_check.rendered_charts import kinds_refused
 
 from tests.kit.config import edited
 from tests.kit.http import serving
@@ -176,6 +176,6 @@ def test_what_to_do_about_a_kind(field: str, kind: str, remedy: str) -> None:
     state = MemoryRepo(edited(DOMAINS, 'nodes: ["*"]', f'nodes: ["*"]\n    {field}')).state
     release = next(one for found in trial_releases(state.config).values() for one in found)
     group, _, name = kind.partition("/")
-    (fault,) = _Run(None, state)._kinds_refused(Report(((group, name),)), release)
+    (fault,) = kinds_refused(Report(((group, name),)), release, state.config)
     assert f"renders a {name}, which is not among the kinds of access domain 'perc" in fault.message
     assert remedy in fault.message
