@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 from demandops.decide.changeset import trial_releases
 from demandops.repo.merge_check import confined_process
-from demandops.repo.merge_check import helm as helm_runs
-from demandops.repo.merge_check.helm import (
+from demandops.repo.merge_check import rendered_charts as helm_runs
+from demandops.repo.merge_check.rendered_charts import (
     HELM_BIN,
     Helm,
     Report,
+    kinds_refused,
     parsed_error,
     parsed_kinds,
     parsed_lint,
 )
-from demandops.repo.merge_check.rendered_charts import kinds_refused
 
 from tests.kit.config import edited
 from tests.kit.http import serving
@@ -103,7 +103,7 @@ def test_output_without_end_is_a_fault(ran: Ran) -> None:
 
 
 def test_a_program_that_loops_is_a_fault(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(helm_runs, "_CPU_SECONDS", 1)
+    monkeypatch.setattr(helm_runs, "_HELM_CPU_S", 1)
     report = ran("while True: pass")
     assert not report.ended
     assert report.faults
