@@ -156,12 +156,11 @@ class Demands:
         self._limit, self._requester_limit = limit, requester_limit
         self._of_requester = Counter[str]()
         self._changed = runtime.condition()
-        self._tickets = dict(journal.pending)
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
         self._queue = FairQueue(in_order=requester_limit is None)
-        for ticket in self._tickets.values():
+        for ticket in journal.pending.values():
             log.info("resuming demand %s from the journal", ticket.operation)
             if ticket.proposal is None:
                 self._enqueue(ticket)
@@ -178,7 +177,7 @@ class Demands:
     def proposed(self) -> list[Ticket]:
         """The demands of all proposals; a new one may not be on its branch yet."""
         with self._changed:
-            return [ticket for ticket in self._tickets.values() if ticket.proposal is not None]
+            return [ticket for ticket in self._journal.pending.values() if ticket.proposal]
 
     @property
     def unpublished(self) -> int:
@@ -264,18 +263,17 @@ class Demands:
     def _take_in(self) -> None:
         if not self._arrived:
             return
-        taken, refused = list[Ticket](), list[tuple[Ticket, DemandOpsError]]()
+        taken, refused = dict[str, Ticket](), list[tuple[Ticket, DemandOpsError]]()
         with self._changed:
             for _ in range(len(self._arrived)):
                 ticket = self._arrived.popleft()
-                if (error := self._why_refused(ticket, len(taken))) is not None:
+                if (error := self._why_refused(ticket, taken)) is not None:
                     refused.append((ticket, error))
                     continue
                 self._of_requester[ticket.requester] += 1
-                self._tickets[ticket.operation] = ticket
-                taken.append(ticket)
+                taken[ticket.operation] = ticket
             try:
-                self._journal.append(taken)
+                self._journal.append(taken.values())
             except Exception as failure:
                 if isinstance(failure, DemandOpsError):
                     why = failure
@@ -284,31 +282,30 @@ class Demands:
                     why = errors.internal(failure)
                     log.exception("internal error while journaling demands")
                 self.wake()  # so that the worker ends the process if the journal is unsound
-                for ticket in taken:
-                    del self._tickets[ticket.operation]
+                for ticket in taken.values():
                     self._of_requester[ticket.requester] -= 1
                     refused.append((ticket, why))
-                taken = []
-            for ticket in taken:
+                taken = {}
+            for ticket in taken.values():
                 _change(ticket, "queued")
                 self._queue.append(ticket)
-            self._new += taken
+            self._new += taken.values()
             self._changed.notify()
-        for ticket in taken:
+        for ticket in taken.values():
             ticket.journaled.set_result(True)
         for ticket, error in refused:
             ticket.refuse(error)
 
-    def _why_refused(self, ticket: Ticket, others: int) -> DemandOpsError | None:
+    def _why_refused(self, ticket: Ticket, others: dict[str, Ticket]) -> DemandOpsError | None:
         if self.is_closed:
             return ShuttingDown("the generator is shutting down; send the demand again later")
         # the others were accepted just before, and are not queued yet
-        if others + len(self._queue) >= self._limit:
+        if len(others) + len(self._queue) >= self._limit:
             why = f" and cannot be published ({self.blocked})" if self.blocked else ""
             return QueueFull(
                 f"{self._limit} demands are queued already{why}; send the demand again later"
             )
-        if ticket.operation in self._tickets:
+        if ticket.operation in self._journal.pending or ticket.operation in others:
             message = "is the operation id of another demand; choose a new one"
             return errors.Refused([errors.fault("", f"'{ticket.operation}' {message}")])
         who = ticket.requester
@@ -355,9 +352,11 @@ class Demands:
     def withdraw(self, operation: str) -> bool:
         self._take_in()
         with self._changed:
-            ticket = self._tickets.get(operation)
-            if ticket is None or "withdrawn" not in _NEXT[ticket.state]:
-                return ticket is not None and ticket.state == "withdrawn"
+            ticket = self._journal.pending.get(operation)
+            if ticket is None:
+                return operation in (withdrawn.operation for withdrawn in self._taken_back)
+            if "withdrawn" not in _NEXT[ticket.state]:
+                return ticket.state == "withdrawn"
             try:
                 self._withdraw(ticket, TAKEN_BACK)
             except (StateRepoError, Unsound) as error:  # if unsound, the worker ends the process
@@ -369,7 +368,7 @@ class Demands:
     def _give_up_what_is_dropped(self) -> None:
         for request in self._journal.drop_requests():
             with self._changed:
-                ticket = self._tickets.get(request.name.partition("-")[2])
+                ticket = self._journal.pending.get(request.name.partition("-")[2])
                 if ticket is None:  # it is answered
                     request.unlink()
                 elif ticket.state != "withdrawn":
@@ -443,8 +442,9 @@ class Demands:
                     self._journal.mark_done(operations)
             for ticket, _ in results:
                 _change(ticket, "done")
-                # a proposed demand left the count of its requester already
-                if self._tickets.pop(ticket.operation, None) and ticket.proposal is None:
+                # a proposed demand left the count of its requester already, and the end of a lease
+                # was never in it
+                if ticket.demand.operation != "expire" and ticket.proposal is None:
                     self._leave(ticket)
         for ticket, result in results:
             if isinstance(result, Receipt):
@@ -459,7 +459,7 @@ class Demands:
     def end(self, error: Unsound) -> None:
         self.close()
         with self._changed:
-            left = list(self._tickets.values())
+            left = [*self._journal.pending.values(), *self._taken_back]
         self.fail(left, error, keep=True)
 
     def _enqueue(self, ticket: Ticket) -> None:
