@@ -149,7 +149,8 @@ def test_after_a_kill_in_the_middle_it_is_refused_and_leaves_the_journal(
     with caplog.at_level(logging.INFO), rig.running(str(bare), runtime=Ticking()) as generator:
         assert "resuming demand op-large from the journal" in caplog.text
         assert rig.book(generator, rig.goal(0))[0].outcome == "booked"
-        rig.wait_until(lambda: not generator._demands._journal.pending, "the large demand to be answered")
+        pending = generator._demands._journal.pending
+        rig.wait_until(lambda: not pending, "the large demand to be answered")
         assert generator.unpublished == 0
     assert "demand op-large ('d') from the journal: refused: too-large" in caplog.text
     assert rig.restart(bare)
