@@ -24,14 +24,7 @@ from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import replace
 
 from demandops.base import errors
-from demandops.base.errors import (
-    DemandOpsError,
-    InvalidInput,
-    QueueFull,
-    ShuttingDown,
-    StateRepoError,
-    Unsound,
-)
+from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
 from demandops.serve.journal import Journal, ProposalRecord, Receipt, State, Ticket
@@ -298,11 +291,13 @@ class Demands:
 
     def _why_refused(self, ticket: Ticket, others: dict[str, Ticket]) -> DemandOpsError | None:
         if self.is_closed:
-            return ShuttingDown("the generator is shutting down; send the demand again later")
+            return errors.ShuttingDown(
+                "the generator is shutting down; send the demand again later"
+            )
         # the others were accepted just before, and are not queued yet
         if len(others) + len(self._queue) >= self._limit:
             why = f" and cannot be published ({self.blocked})" if self.blocked else ""
-            return QueueFull(
+            return errors.QueueFull(
                 f"{self._limit} demands are queued already{why}; send the demand again later"
             )
         if ticket.operation in self._journal.pending or ticket.operation in others:
@@ -311,7 +306,7 @@ class Demands:
         who = ticket.requester
         if (limit := self._requester_limit) is not None and self._of_requester[who] >= limit:
             whose = f"of {quoted(who)}" if who else "without a requester"
-            return QueueFull(
+            return errors.QueueFull(
                 f"{limit} demands {whose} have no answer yet; send the demand again "
                 "later, or raise the node's parameter requester_queue_limit"
             )
@@ -359,7 +354,10 @@ class Demands:
                 return ticket.state == "withdrawn"
             try:
                 self._withdraw(ticket, TAKEN_BACK)
-            except (StateRepoError, Unsound) as error:  # if unsound, the worker ends the process
+            except (
+                errors.StateRepoError,
+                errors.Unsound,
+            ) as error:  # if unsound, the worker ends the process
                 log.error("demand %s cannot be withdrawn: %s", operation, error)
                 self.wake()
                 return False
@@ -417,7 +415,11 @@ class Demands:
             if isinstance(result, Receipt) or ticket.state == "done":
                 continue
             if str(result) != TAKEN_BACK:  # a client that took its demand back needs no notice
-                text = result.text_with_codes() if isinstance(result, InvalidInput) else str(result)
+                text = (
+                    result.text_with_codes()
+                    if isinstance(result, errors.InvalidInput)
+                    else str(result)
+                )
                 ticket.notify("refused", text)
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
@@ -433,7 +435,7 @@ class Demands:
                 )
                 try:
                     self._journal.mark_done(operations, durably=durably)
-                except StateRepoError as error:  # the next write makes the removal durable
+                except errors.StateRepoError as error:  # the next write makes the removal durable
                     log.error(
                         "an answer cannot be journaled, so after a crash the demand may be carried "
                         "out again: %s",
@@ -456,7 +458,7 @@ class Demands:
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
         self.answer([(ticket, error) for ticket in batch], keep)
 
-    def end(self, error: Unsound) -> None:
+    def end(self, error: errors.Unsound) -> None:
         self.close()
         with self._changed:
             left = [*self._journal.pending.values(), *self._taken_back]

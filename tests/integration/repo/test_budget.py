@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.serve import worker
+from demandops.serve import agenda
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Ticket
 
@@ -80,7 +80,7 @@ def sender(generator: Generator, order: list[str]) -> Send:
 def test_who_sends_what_takes_too_long_holds_up_others_for_one_demand(
     bare: Path, made: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker, "LONGEST_EVALUATION_S", 0.0)
+    monkeypatch.setattr(agenda, "LONGEST_EVALUATION_S", 0.0)
     order: list[str] = []
     with rig.running(bare, runtime=Ticking()) as generator:
         send = sender(generator, order)
@@ -98,7 +98,7 @@ def test_who_sends_what_takes_too_long_holds_up_others_for_one_demand(
 
 
 def test_a_demand_that_comes_meanwhile_is_next(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker, "LONGEST_EVALUATION_S", 0.0)
+    monkeypatch.setattr(agenda, "LONGEST_EVALUATION_S", 0.0)
     order: list[str] = []
     busy = rig.Gate()
     with rig.running(bare, runtime=Ticking()) as generator:
