@@ -347,11 +347,10 @@ class Demands:
     def withdraw(self, operation: str) -> bool:
         self._take_in()
         with self._changed:
-            ticket = self._journal.pending.get(operation)
-            if ticket is None:
-                return operation in (withdrawn.operation for withdrawn in self._taken_back)
-            if "withdrawn" not in _NEXT[ticket.state]:
-                return ticket.state == "withdrawn"
+            tickets = {ticket.operation: ticket for ticket in self._taken_back}
+            ticket = self._journal.pending.get(operation) or tickets.get(operation)
+            if ticket is None or "withdrawn" not in _NEXT[ticket.state]:
+                return ticket is not None and ticket.state == "withdrawn"
             try:
                 self._withdraw(ticket, TAKEN_BACK)
             except (
