@@ -438,6 +438,8 @@ class Worker:
             if getattr(error, "errno", None) is None:
                 told = access_error(error, self._repository.address, self._repository.objects)
                 if isinstance(told, StateRepoError):
+                    if self._repository.renew_if_damaged():
+                        raise Unavailable(f"{told}; the clone is made anew") from None
                     return told
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return errors.internal(error)
@@ -580,10 +582,15 @@ class Worker:
                 self._try_to_carry_out_changes()
             # a deleted branch may have been merged, which only a main as new as ``heads`` shows
             if self._repository.includes(str(self.snapshot.commit), heads.main):
-                self._approvals.check(self.snapshot, heads)
+                self._approvals.check(self.snapshot, heads, self._publish_record)
                 self._agenda.checked(str(self.snapshot.commit))
         except (Unavailable, PushDenied) as error:
             log.warning("%s; the demands that await approval keep waiting", error)
+
+    def _publish_record(self, commits: CommitBatch) -> bool:
+        if is_published := commits.publish():
+            self._record_published(commits)
+        return is_published
 
     def _try_to_carry_out_changes(self, *, again: bool = False) -> None:
         try:

@@ -322,10 +322,10 @@ class RemoteRepository(StateRepository):
         pairs = (line.split("\t", 1) for line in listed.out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
-    def fetch_branches(self, prefix: str) -> None:
+    def fetch_branches(self, *prefixes: str) -> None:
         # what the remote has deleted, this clone deletes too
-        spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
-        fetched = self._run_git(*_FETCH, "--prune", self._url, spec)
+        specs = (f"+refs/heads/{each}*:refs/remotes/origin/{each}*" for each in prefixes)
+        fetched = self._run_git(*_FETCH, "--prune", self._url, *specs)
         if fetched.code:
             raise self._read_error("fetched", fetched)
 

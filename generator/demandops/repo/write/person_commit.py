@@ -6,7 +6,7 @@ The person is author and committer, so a generator reads the commit like any oth
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 from pygit2 import Blob, Commit, Oid, Tree
@@ -16,13 +16,17 @@ from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
+from demandops.base.strict_yaml import with_lines
+from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.repo.git import tree as trees
+from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.repository import MAIN, StateRepository
 from demandops.repo.history import commit_message
 from demandops.repo.history.commit_log import Person
 from demandops.repo.history.commit_message import compose
 from demandops.repo.load import snapshot as snapshots
+from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.proposal_branch import PendingProposal, ProposalBranches
 
 _ATTEMPTS = 5
@@ -38,9 +42,12 @@ class CommitDetails:
     now: datetime
     summary: str
     reason: str = ""
+    trailers: tuple[tuple[str, str], ...] = ()  # for programs; the reason may be one of them
 
     @property
     def text(self) -> str:
+        if self.trailers:
+            return compose([[self.summary]], self.trailers)
         # the person's reason is as written: it may close an issue
         return compose([[self.summary]], []) + (
             f"\n{one_line(self.reason)}\n" if self.reason else ""
@@ -74,6 +81,32 @@ def commit_to_branch(
     return Published(str(commit), branch, link)
 
 
+def reject(
+    repository: StateRepository, proposal: PendingProposal, details: CommitDetails
+) -> Published:
+    """Record on main, in a commit without files, that a person rejects a proposal."""
+    trailers = commit_message.rejection_trailers(
+        proposal.branch, proposal.commit, proposal.demands, proposal.requesters, details.reason
+    )
+    details = replace(details, trailers=tuple(trailers))
+
+    def make(tip: Commit) -> tuple[Files, list[Oid]]:
+        _require_unmoved(repository, proposal)
+        return {}, [tip.id]
+
+    return _publish(repository, make, details)
+
+
+def _require_unmoved(repository: StateRepository, proposal: PendingProposal) -> None:
+    # If the branch moves only after this, its commit is answered all the same: a demand that was
+    # changed waits on another branch.
+    if ProposalBranches(repository).heads().branches.get(proposal.branch) != proposal.commit:
+        raise StateRepoError(
+            f"{proposal.branch} is no longer at commit {proposal.commit}, so nothing was changed; "
+            "look at the proposals again"
+        )
+
+
 def merge(
     repository: StateRepository, proposal: PendingProposal, details: CommitDetails
 ) -> Published:
@@ -82,13 +115,7 @@ def merge(
     head = trees.commit_of(objects, proposal.commit)
 
     def make(tip: Commit) -> tuple[Files, list[Oid]]:
-        # If the branch moves only after this, its commit is merged all the same: a demand that was
-        # changed waits on another branch.
-        if ProposalBranches(repository).heads().branches.get(proposal.branch) != proposal.commit:
-            raise StateRepoError(
-                f"{proposal.branch} is no longer at commit {proposal.commit}, so nothing was "
-                "merged; look at the proposals again"
-            )
+        _require_unmoved(repository, proposal)
         base = objects.merge_base(tip.id, head.id)
         if base is None:
             raise StateRepoError(
@@ -164,6 +191,24 @@ def _commit(
         if changes_config:
             raise
     return repository.new.add_commit(repository.signer, (who, who), text, tree, parents)
+
+
+def state_after(repository: StateRepository, before: Snapshot, files: Files) -> State:
+    """Return what would be in effect after a commit of these files, which nobody makes.
+
+    InvalidInput is raised if their configuration would not be valid, and StateRepoError if that of
+    ``before`` is not.
+    """
+    objects = repository.reopened()  # it gets the commit in memory
+    new, tip = NewObjects(objects), trees.commit_of(objects, before.commit)
+    _require_valid(repository, tip)
+    who = commit_message.signature("A person", "person@demandops.invalid", REAL.now())
+    tree = new.add_tree(tip.tree, files)
+    commit = new.add_commit(None, (who, who), "", tree, [tip.id])
+    after = snapshots.follow(objects, before, commit, REAL.now()).snapshot
+    if after.faults:
+        raise InvalidInput(with_lines(after.faults, files.get))
+    return after.state
 
 
 def _require_valid(repository: StateRepository, tip: Commit) -> None:

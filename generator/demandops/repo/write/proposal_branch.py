@@ -1,9 +1,10 @@
-"""Proposals in the state repo: branches ``demand/…`` that a person merges to approve the demands.
+"""Proposals in the state repo: branches that a person merges to approve what they change.
 
-The generator rebuilds a branch if newer commits on main make the branch outdated, and deletes the
-branch in the end. If a person added commits to the branch, the generator neither rebuilds it nor
-deletes it after a merge. This module knows nothing of forges except GitLab's push options and the
-link that GitLab prints.
+On ``demand/…`` the generator proposes demands that need approval; on the others people propose
+what commands would else commit to main. The generator rebuilds its branch if newer commits on main
+make the branch outdated, and deletes the branch in the end. If a person added commits to it, the
+generator neither rebuilds it nor deletes it after a merge. This module knows nothing of forges
+except GitLab's push options and the link that GitLab prints.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ from demandops.repo.load import ledger_files
 log = logging.getLogger("demandops")
 
 PREFIX = "demand/"
+# where people propose; a command that proposes something else adds its folder here
+OF_PEOPLE = ("override/", "drain/", "change/")
+_PREFIXES = (PREFIX, *OF_PEOPLE)
 _HEADS = "refs/heads/"
 _NO_OPTIONS = re.compile(r"^fatal: the receiving end does not support push options", re.MULTILINE)
 _LINK = re.compile(r"https?://\S+")
@@ -59,7 +63,8 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        commits = self._repository.list_references(MAIN, f"{_HEADS}{PREFIX}*")
+        patterns = (f"{_HEADS}{prefix}*" for prefix in _PREFIXES)
+        commits = self._repository.list_references(MAIN, *patterns)
         heads = {name.removeprefix(_HEADS): commit for name, commit in commits.items()}
         return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
 
@@ -176,6 +181,7 @@ class ProposalBranches:
 class PendingProposal:
     branch: str
     commit: str  # the newest of the branch, perhaps by a person
+    author: str
     summary: str
     since: datetime  # when the first demand was received
     requesters: tuple[str, ...]
@@ -198,23 +204,27 @@ class PendingProposal:
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     # those whose commits are not on main, sorted by branch
     if isinstance(repository, RemoteRepository):
-        repository.fetch_branches(PREFIX)
-    space = f"{repository.branches}{PREFIX}"
+        repository.fetch_branches(*_PREFIXES)
+    space = repository.branches
     repo = Repository(repository.objects.path)
-    main = repository.tip()
-    for name in sorted(name for name in repo.references if name.startswith(space)):
+    main, folders = repository.tip(), tuple(f"{space}{prefix}" for prefix in _PREFIXES)
+    for name in sorted(name for name in repo.references if name.startswith(folders)):
         try:
             head = repo.references[name].resolve().target
             commits = list(commit_log.commits(repo, head, main))
         except (KeyError, ValueError, TypeError, GitError, StateRepoError):
             _warn_of_unreadable(name)
             continue
-        entries = [entry for _, entry in commits if commit_message.PROPOSAL in entry.trailers]
+        branch = name.removeprefix(space)
+        entries = [entry for _, entry in commits]
+        if branch.startswith(PREFIX):
+            entries = [entry for entry in entries if commit_message.PROPOSAL in entry.trailers]
         if not entries:
             continue
         yield PendingProposal(
-            branch=f"{PREFIX}{name.removeprefix(space)}",
+            branch=branch,
             commit=str(head),
+            author=entries[0].author,
             summary=entries[0].summary,
             since=entries[-1].authored or entries[-1].time,
             requesters=_all_of(entries, "Requester"),
