@@ -33,9 +33,11 @@ from demandops.base.quoting import escaped, lines
 from demandops.model.config.base_model import parse_time, relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
+from demandops.views.causes import KINDS
+from demandops.views.causes import causes as causes_of
 from demandops.views.source import WORDS, Source
 from demandops.views.vocabulary import decision_text
-from demandops.web import fleet_map, lists, not_ready, overview, time_line
+from demandops.web import fleet_map, lists, overview, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Part, Row, rows_of
 from demandops.web.thing import thing
@@ -97,16 +99,16 @@ class ViewRequest:
 
 
 def _overview(asked: ViewRequest) -> tuple[str, Data]:
-    source = asked.source
-    causes = not_ready.causes(source, asked.filter)
+    source, wanted = asked.source, asked.filter
+    causes = [cause for cause in causes_of(source) if wanted.matches(Row({}, cause.labels))]
     moment = source.now if source.is_newest else source.entry.time
     events = [event for event in asked.events() if event.time <= moment]
     return "overview.html.j2", {
-        "figures": overview.figures(source, asked.filter, events, moment),
-        "causes": causes[:_MOST_CAUSES],
+        "figures": overview.figures(source, wanted, events, moment),
+        "causes": [(cause, overview.link_of(cause)) for cause in causes[:_MOST_CAUSES]],
         "total": len(causes),
-        "applications": not_ready.applications(source, causes, asked.filter),
-        "tones": {**WORDS, **not_ready.KINDS},
+        "applications": overview.applications(source, causes, wanted),
+        "tones": {**WORDS, **KINDS},
         "events": islice(overview.newest(events), _NEWEST),
         "overrides": source.overrides,
     }
