@@ -9,7 +9,7 @@ import io
 import os
 import shutil
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
@@ -90,8 +90,8 @@ def open_streams() -> None:
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
 
 
-def terminal_width() -> int | None:
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+def terminal_width() -> int:
+    return shutil.get_terminal_size().columns  # 80 elsewhere than on a terminal
 
 
 def painted(text: str, style: str) -> str:
@@ -163,15 +163,6 @@ def read_by(parse: Callable[[str], Any]) -> Callable[..., Any]:
             raise click.BadParameter(str(error)) from None
 
     return value
-
-
-def version_lines(data: Mapping[str, Any]) -> list[str]:
-    # of what `json_output.version_data` returns
-    asked = data["versions_asked"].items()
-    return [
-        data["application_version"] or data["version"] or "",
-        *(f"{version} requested by {', '.join(requesters)}" for version, requesters in asked),
-    ]
 
 
 def show_slow(text: str) -> None:  # an empty text clears the line

@@ -14,7 +14,7 @@ import click
 from demandops.base.errors import Fault, InvalidInput, Refused
 from demandops.base.runtime import REAL
 from demandops.cli.changes import person_change
-from demandops.cli.json_output import Json, claim_data, faults_of, output_option, show
+from demandops.cli.json_output import faults_of, output_option, show
 from demandops.cli.output import busy, console, done, errors, progress
 from demandops.cli.queries.diff import release_lines
 from demandops.cli.target import dry_run_option, names_of, signing_option, writable_repo_option
@@ -30,6 +30,7 @@ from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Receipt
+from demandops.views.vocabulary import Json, claim_data
 
 # ---- booking, and printing the changes ----
 

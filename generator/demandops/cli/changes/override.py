@@ -22,7 +22,6 @@ from demandops.cli import json_output, target
 from demandops.cli.authoring.scaffold import document
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import writable
-from demandops.cli.json_output import Json
 from demandops.cli.output import done, errors, progress
 from demandops.cli.target import names_of
 from demandops.decide.override_report import override_report
@@ -35,6 +34,8 @@ from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails, Published
 from demandops.serve.approvals.proposal import merge_request
+from demandops.views import vocabulary
+from demandops.views.vocabulary import Json
 
 # ---- what the commands share: their options and selection ----
 
@@ -290,10 +291,10 @@ def _carry_out(
         "branch": None,
         "link": None,
         "text": text,
-        "override": json_output.override_data(entry.override),
+        "override": vocabulary.override_data(entry.override),
         "state": entry.state,
-        "releases": [json_output.release_data(release) for release in entry.releases],
-        "claims": [json_output.claim_data(claim) for claim in entry.claims],
+        "releases": [vocabulary.release_data(release) for release in entry.releases],
+        "claims": [vocabulary.claim_data(claim) for claim in entry.claims],
     }
     lines = [f"{summary}: nothing was changed"]
     lines += [f"    {line}" for line in (text or "").splitlines()]

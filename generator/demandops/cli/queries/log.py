@@ -11,7 +11,7 @@ import click
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import Json, commit_data, output_formats, show, time_text
+from demandops.cli.json_output import output_formats, show
 from demandops.cli.output import busy
 from demandops.cli.table import Table, column, table_of
 from demandops.cli.target import name_options, state_repo_option
@@ -20,6 +20,7 @@ from demandops.repo import reader
 from demandops.repo.history import revisions
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.reader import Reader
+from demandops.views.vocabulary import Json, commit_data, time_text
 
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
@@ -164,7 +165,7 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
 _COLUMNS = (
     column("Commit", lambda row, now: row["commit"][:10]),
     column("When", lambda row, now: relative(parse_time(row["time"]), now), 2),
-    column("What", "summary", wraps=True),
+    column("What", "summary"),
     column(
         "Requesters",
         lambda row, now: (
@@ -174,7 +175,6 @@ _COLUMNS = (
             else ", ".join(row["requesters"]) or row["author"]
         ),
         1,
-        wraps=True,
     ),
 )
 _WIDE = (

@@ -12,10 +12,8 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli import json_output
-from demandops.cli.json_output import Json, commit_data, override_data, release_data, time_text
 from demandops.cli.output import at_option, busy
 from demandops.cli.queries.diff import loaded
-from demandops.cli.queries.get import effect_words
 from demandops.cli.target import names_of, state_repo_option
 from demandops.decide.override_report import affected_releases, override_report
 from demandops.decide.planning.overrides import suspended_by, without_suspended
@@ -32,8 +30,10 @@ from demandops.repo.history.commit_log import LogEntry, PathHistory
 from demandops.repo.load import ledger_files
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
-from demandops.views import release_causes
+from demandops.views import release_causes, vocabulary
 from demandops.views.demand_lists import nodes_of
+from demandops.views.kinds import effect_texts
+from demandops.views.vocabulary import Json, commit_data, override_data, release_data, time_text
 
 # ---- the object that has the given name ----
 
@@ -387,7 +387,7 @@ def _described(world: World, match: Match) -> Json:
         claims = release_causes.claims_behind(without_suspended(world).ledger, release)
         return {
             "runs": True,
-            **json_output.place_data(release),
+            **vocabulary.place_data(release),
             **_claims(claims, world),
             "shaped_by": [
                 {"file": file, "entry": entry or None, "what": what}
@@ -406,7 +406,7 @@ def _described(world: World, match: Match) -> Json:
         return {
             "runs": any(suspended_by(claim, world) is None for claim in claims),
             "what": what,
-            "subject": json_output.subject_data(match.subject),
+            "subject": vocabulary.subject_data(match.subject),
             **_claims(claims, world),
             "releases": [release_data(release) for release in releases],
         }
@@ -417,7 +417,7 @@ def _described(world: World, match: Match) -> Json:
         release, override = denied
         return {
             "runs": False,
-            **json_output.place_data(release),
+            **vocabulary.place_data(release),
             "denied_by": override_data(override, ("deny",)),
         }
     if match.kind == "demand":
@@ -446,7 +446,7 @@ def _described(world: World, match: Match) -> Json:
         override = config.overrides[name]
         report = override_report(world, REAL.now())
         (entry,) = (entry for entry in report if entry.override == override)
-        effects = ", ".join(effect_words(override_data(override)))
+        effects = ", ".join(effect_texts(override_data(override)))
         return {
             "runs": entry.state == "in force",
             "state": entry.state,
@@ -480,7 +480,7 @@ def _claims(claims: list[Claim], world: World) -> Json:
         suspended = suspended_by(claim, world)
         kept = world.config.overrides.get(claim.keeping_override or "")
         rows.append(
-            json_output.claim_data(claim)
+            vocabulary.claim_data(claim)
             | {
                 "release_by": release_causes.how_to_release(claim),
                 "overdue": claim.lease is not None and claim.lease.has_ended(REAL.now()),
