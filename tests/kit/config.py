@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import yaml
 from demandops.decide.state import State
-from demandops.model.config import cross_check
 from demandops.model.config.config import CONFIG_ROOTS, Config
-from demandops.model.config.override import Override, Selector
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.new_repo import files
 from demandops.templating.values import evaluate
@@ -61,43 +58,6 @@ def override(*select: Mapping[str, Any], **fields: Any) -> str:
     head = {"apiVersion": "demandops/v1", "kind": "Override"}
     why = {"reason": "a field test", "owner": "petra"}
     return yaml.safe_dump(head | why | {"select": list(select)} | fields, sort_keys=False)
-
-
-def may_select_same_release(
-    one: Iterable[Selector], other: Iterable[Selector], config: Config
-) -> bool:
-    """Return whether some release may match selectors of both overrides, by comparing all pairs."""
-    shares = cross_check.shares_any_clients(config)
-    return any(
-        cross_check.may_match_same_release(*pair, config, shares) for pair in product(one, other)
-    )
-
-
-SINGLE = ("version", "replicas", "node")
-FROZEN = (*SINGLE, "values", "images")
-
-
-def contested_effects(first: Override, second: Override) -> list[str]:
-    """Return what two overrides of a priority set differently, pair by pair, as an oracle."""
-    contested = [
-        name
-        for name in SINGLE
-        if None not in (left := getattr(first, name), right := getattr(second, name))
-        and left != right
-    ]
-    if first.values and second.values and not patches_commute(first.values, second.values):
-        contested.append("values")
-    pins = (first.images or {}, second.images or {})
-    contested += [
-        f"images.{name}"
-        for name in sorted({*pins[0]} & {*pins[1]})
-        if pins[0][name] != pins[1][name]
-    ]
-    for holding, shaping in ((first, second), (second, first)):
-        effects = [name for name in shaping.effects() if name in FROZEN]
-        if holding.hold and effects:
-            contested += ["hold", *effects]
-    return contested
 
 
 def patches_commute(first: object, second: object) -> bool:

@@ -416,9 +416,6 @@ class ConnectionType(ABC):
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
         return iter(())
 
-    def shares_clients(self, config: Config) -> bool:
-        return False
-
     @abstractmethod
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield why the type cannot link two nodes; the admission reports unknown nodes."""

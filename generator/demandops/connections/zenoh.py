@@ -39,9 +39,6 @@ class Zenoh(routes.ConnectionType):
                     "of the two bridges",
                 ).within(file)
 
-    def shares_clients(self, config: Config) -> bool:
-        return any(node.zenoh for node in config.nodes.values())
-
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         source, target = config.nodes.get(connection.source), config.nodes.get(connection.target)
         if source is None or target is None:

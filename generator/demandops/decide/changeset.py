@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Any, Literal
@@ -126,7 +126,7 @@ def render_change(
     With ``keeps_late``, a release whose values take too long to compute keeps its file, instead of
     OverLimit.
     """
-    files, texts = {**planned.ledger_files}, _Texts(config, evaluate)
+    files = {**planned.ledger_files}
     releases, shaped, blocked = list[ReleaseChange](), set[str](), list[str]()
     for key, new in planned.plans.items():
         checkpoint()
@@ -135,7 +135,7 @@ def render_change(
         new_path = path_of(new) if new else None
         current = read(new_path) if new_path else None
         try:
-            text = texts.text_of(new, current) if new else None
+            text = gitops.release_text(new, config, evaluate, current) if new else None
         except OverLimit:
             if keeps_late or old == new:  # what only renews a lease needs no template
                 continue
@@ -152,8 +152,6 @@ def render_change(
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
         if text is not None and text == current:
             continue
-        if old and new and text is not None:
-            old = texts.with_new_values_of_unused(old, new, text)
         if old or new:
             releases.append(describe_change(old, new, current is not None))
     _refuse_large(files, config.repo_settings.limits.file_bytes, read)
@@ -186,7 +184,6 @@ def render_all(
     """
     config, keys = world.config, all_keys(world)
     files = gitops.base_files(config)
-    texts = _Texts(config, evaluate)
     collisions.refuse_shared_names(world, keys)  # one would overwrite the file of the other
     for key in keys:
         release = plan(world, key)
@@ -194,54 +191,13 @@ def render_all(
             continue
         path = path_of(release)
         try:
-            files[path] = texts.text_of(release, current.get(path))
+            files[path] = gitops.release_text(release, config, evaluate, current.get(path))
         except OverLimit:
             if not keeps_late:
                 raise
             if path in current:
                 files[path] = current[path]
     return files | gitops.kept_charts(files, current, world)
-
-
-@dataclass(slots=True)
-class _Texts:
-    """The texts of releases. A template that took too long for one is not tried for others."""
-
-    config: Config
-    evaluate: Evaluate
-    _late: dict[str, OverLimit] = field(default_factory=dict)
-    _used: dict[tuple[str, str], bool] = field(default_factory=dict)  # by template and parameter
-
-    def text_of(self, release: Release, current: str | None) -> str:
-        template = ""
-        if isinstance(release, ServiceRelease):
-            template = self.config.values_template(release.service)
-        if template in self._late:
-            raise self._late[template]
-        try:
-            return gitops.release_text(release, self.config, self.evaluate, current)
-        except OverLimit as error:
-            self._late[template] = error
-            raise
-
-    def with_new_values_of_unused(self, old: Release, new: Release, text: str) -> Release:
-        # A service has all parameters of its definition, but its template may use only some. One
-        # that leaves the file as it is with its old value is no part of the change.
-        if not isinstance(old, ServiceRelease) or not isinstance(new, ServiceRelease):
-            return old
-        template, unused = self.config.values_template(new.service), dict[str, object]()
-        for name, value in new.parameters.items():
-            if new.shaping.held or old.parameters.get(name, value) == value:
-                continue
-            if (template, name) not in self._used:
-                self._used[template, name] = True
-                with suppress(InvalidInput):
-                    former = {**new.parameters, name: old.parameters[name]}
-                    tried = self.text_of(replace(new, parameters=former), None)
-                    self._used[template, name] = tried != text
-            if not self._used[template, name]:
-                unused[name] = value
-        return replace(old, parameters={**old.parameters, **unused})
 
 
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
@@ -361,16 +317,11 @@ def _render_errors(
     releases: Iterable[ServiceRelease], config: Config, evaluate: Evaluate
 ) -> list[InvalidInput]:
     errors: list[InvalidInput] = []
-    late = set[str]()  # a template that takes too long is tried only once
     for release in releases:
-        if config.values_template(release.service) in late:
-            continue
         try:
             gitops.render(release, config, evaluate)
         except InvalidInput as error:
             errors.append(error)
-            if isinstance(error, OverLimit):
-                late.add(config.values_template(release.service))
     return errors
 
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
-from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
-from itertools import groupby, islice, takewhile
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from difflib import SequenceMatcher
+from itertools import combinations, groupby, islice
 
 from demandops.base import strict_yaml
-from demandops.base.errors import MOST_FAULTS, Fault, fault, suggestion
+from demandops.base.errors import Fault, fault, suggestion
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, needed_access
@@ -23,12 +25,14 @@ from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.release_keys import claims_needing
 from demandops.model.config.appdef import ignored_fields
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, NODES_FILE, Config
-from demandops.model.config.policy import AccessDomain, matches
+from demandops.model.config.override import Override
+from demandops.model.config.policy import matches
 from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import Changes, World
-from demandops.templating import charts
+from demandops.model.release import Release
+from demandops.templating.charts import overridden
 
 # ---- missing inputs: topics that applications read or deliver, but that do not arrive ----
 #
@@ -150,102 +154,101 @@ def lost_output_notes(changes: Changes, after: World) -> Iterator[str]:
 # Nobody lists all topics of a node, so an unknown topic alone is no mistake. Names that differ in a
 # digit, or in a letter of a short word (``lidar_fl``, ``lidar_fr``), count as two correct topics.
 
-_WORD = re.compile(r"[A-Za-z]+")
+_WORDS = re.compile(r"[A-Za-z]+|[^A-Za-z]+")
 # In words with fewer letters, one other letter often makes another correct word.
 _SHORT = 4
 
 
 def notes(request: Demand, before: World) -> Iterator[str]:
     # ``before`` is the world before the demand, or its own topics would all be known
-    if not request.adds_claims:
-        return
-    known, own = _KnownTopics(before.config), request.demand
-    booked: dict[str, frozenset[str]] = {}
-
-    def earlier(node: str, topic: str) -> Collection[str]:
-        # thousands of claims may read from a node, but nearly always one of them names the topic
-        if any(claim.demand != own for claim in before.ledger.each_with("takes", node, topic)):
-            return (topic,)
-        if node not in booked:
-            claims = (
-                claim for claim in before.ledger.each_with("from", node) if claim.demand != own
-            )
-            named = (named for claim in claims for named in _named_topics(claim.held))
-            booked[node] = frozenset(topic for sender, topic in named if sender == node)
-        return booked[node]
-
-    for item in request.demanded:
-        yield from known.notes_on(item.held, earlier)
-
-
-def misspelled_topic_warnings(world: World) -> Iterator[Fault]:
-    known, earlier = _KnownTopics(world.config), defaultdict[str, set[str]](set)
-    claims = ((claim.booked, claim_files.path_of(claim.key), claim) for claim in world.ledger)
-    for _, path, claim in sorted(claims, key=lambda entry: entry[:2]):
-        for note in known.notes_on(claim.held, lambda node, _: earlier[node]):
-            yield fault("", note).within(path)
-        for node, topic in _named_topics(claim.held):
-            earlier[node].add(topic)
+    known: dict[str, set[str]] = {}
+    told = set[tuple[str, str]]()
+    for item in request.demanded if request.adds_claims else ():
+        what = "application" if isinstance(item.held, Application) else "connection"
+        for node, topic in _named_topics(item.held):
+            if (node, topic) in told:
+                continue
+            told.add((node, topic))
+            # thousands of claims may read from a node, but nearly always one of them names the
+            # topic
+            reading = before.ledger.each_with("takes", node, topic)
+            if any(claim.demand != request.demand for claim in reading):
+                continue
+            if node not in known:
+                entry, known[node] = before.config.nodes.get(node), set()
+                if entry:
+                    known[node].update(entry.topics.values(), entry.types, *entry.bridged.values())
+                for claim in before.ledger.each_with("from", node):
+                    if claim.demand != request.demand:
+                        topics = _named_topics(claim.held)
+                        known[node] |= {named for sender, named in topics if sender == node}
+            if topic in known[node]:
+                continue
+            if near := [each for each in known[node] if _is_misspelling(topic, each)]:
+                meant = f"did you mean '{min(near)}'?"
+                yield f"{what} '{item.held.id}': '{node}' is not known to publish {topic}; {meant}"
 
 
-def _named_topics(held: Application | Connection) -> list[tuple[str, str]]:
+def _named_topics(held: Held) -> list[tuple[str, str]]:
     if isinstance(held, Application):
         return [(topic.source, topic.topic) for _, topic in held.all_inputs()]
     return [(key.sender, key.topic) for key in map(held.key_of, held.topics)]
 
 
-@dataclass(slots=True)
-class _KnownTopics:
-    config: Config
-    _listed: dict[str, set[str]] = field(default_factory=dict)
-    _told: set[tuple[str, str]] = field(default_factory=set)
-
-    def notes_on(
-        self,
-        held: Application | Connection,
-        earlier: Callable[[str, str], Collection[str]],
-    ) -> Iterator[str]:
-        """Yield a note for each topic that is probably misspelled.
-
-        ``earlier`` maps a node and a topic to the topics that earlier demands name for the node.
-        """
-        what = "application" if isinstance(held, Application) else "connection"
-        for node, topic in _named_topics(held):
-            if node not in self._listed:
-                entry = self.config.nodes.get(node)
-                own = {*entry.topics.values(), *entry.types} if entry else set[str]()
-                self._listed[node] = own.union(*entry.bridged.values()) if entry else own
-            listed, booked = self._listed[node], earlier(node, topic)
-            if (node, topic) in self._told or topic in listed or topic in booked:
-                continue
-            near = [each for each in (*listed, *booked) if _is_misspelling(topic, each)]
-            if near:
-                self._told.add((node, topic))
-                meant = f"did you mean '{min(near)}'?"
-                yield f"{what} '{held.id}': '{node}' is not known to publish {topic}; {meant}"
-
-
 def _is_misspelling(topic: str, other: str) -> bool:
-    """Return whether ``topic`` differs from ``other`` by one mistake in a word of some length.
+    """Return whether two topics differ by one mistake in one word of some length.
 
     The mistake is one wrong, missing or additional letter, or two letters in the wrong order.
     """
-    if abs(len(topic) - len(other)) > 1:
+    words = _WORDS.findall(topic), _WORDS.findall(other)
+    if abs(len(topic) - len(other)) > 1 or len(words[0]) != len(words[1]):
         return False
-    start = _common(topic, other)
-    end = _common(topic[start:][::-1], other[start:][::-1])
-    written, correct = topic[start : len(topic) - end], other[start : len(other) - end]
-    if sorted(written) != sorted(correct) and max(len(written), len(correct)) > 1:
+    differing = [pair for pair in zip(*words, strict=True) if pair[0] != pair[1]]
+    if len(differing) != 1 or not "".join(differing[0]).isalpha() or len(differing[0][1]) < _SHORT:
         return False
-    if len(written) > len("ab") or not (written + correct).isalpha():
-        return False
-    word = next(match for match in _WORD.finditer(other + " a") if match.end() >= start)
-    return len(word[0]) >= _SHORT and word.start() <= start
+    # such a mistake leaves all other letters as they are
+    longest = max(map(len, differing[0]))
+    return SequenceMatcher(None, *differing[0], autojunk=False).ratio() >= 1 - 1 / longest
 
 
-def _common(text: str, other: str) -> int:
-    pairs = zip(text, other, strict=False)
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+# ---- overrides of equal priority that set the same of one release differently ----
+#
+# Of these, the one whose name comes last counts, on every machine. Few people want that.
+
+
+def tied_override_warnings(releases: Iterable[Release]) -> Iterator[Fault]:
+    ties: dict[tuple[str, str], Fault] = {}
+    for release in releases:
+        # thousands may select one release, and then the first of them show what is wrong
+        for (first, mine), (last, theirs) in islice(combinations(release.shaping.by, 2), 1000):
+            if first.priority != last.priority:
+                continue
+            tied = [
+                name
+                for name in mine
+                if name in theirs and _result(name, first, last) != _result(name, last, first)
+            ]
+            if ("hold" in mine) != ("hold" in theirs) and {*mine, *theirs} - {"hold", "keep"}:
+                tied.append("hold")
+            if tied:
+                what = " and ".join(f"'{name}'" for name in tied)
+                message = (
+                    f"is {last.priority}, as in {first.path}, and both set {what} of "
+                    f"{release.name}; {last.path} counts, because its name comes last; give the "
+                    "one that shall count a higher priority"
+                )
+                told = fault("priority", message).within(last.path)
+                ties.setdefault((last.path, first.path), told)
+    yield from (ties[pair] for pair in sorted(ties))
+
+
+def _result(effect: str, first: Override, last: Override) -> str:
+    before, after = getattr(first, effect), getattr(last, effect)
+    if effect == "values":
+        after = overridden(overridden({}, before, None), after, None)
+    elif effect == "images":
+        after = {**before, **after}
+    return json.dumps(after, sort_keys=True, default=str)  # 1 and true are not the same
 
 
 # ---- fields that are read and ignored ----
@@ -312,22 +315,13 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
 
 # ---- warnings about access domains, nodes and requirements, which ``demandops check`` shows ----
 #
-# Some warnings report what the cluster will refuse or what demands cannot get. Others report an
-# access that the cluster cannot prevent. None is a fault, because the check may not know enough.
-# For example, a chart may render a refused kind only with certain values, and only Helm can find
-# that out.
+# They report what demands cannot get, and an access that the cluster cannot prevent.
 
-# Kinds are read line by line, because a template of Helm is no YAML before it is rendered.
-_KIND = re.compile(r"kind:[ \t]*(?P<kind>[^#]*)")
-_PLAIN = re.compile(r"\"?([A-Z][A-Za-z0-9]*)\"?")
-_TEMPLATE = re.compile(r"(.*/)?templates/(?!tests/).*\.(ya?ml|tpl)")
-_CRDS = re.compile(r"(.*/)?crds/.*")
 _MOST_NODES = 3
 
 
 def policy_warnings(world: World) -> Iterator[Fault]:
     config = world.config
-    yield from _kinds_of_charts(config)
     yield from _open_by_host_network(config)
     yield from _connections_no_longer_allowed(world)
     for node, excess in overcommitted(world, whole_usage(world)):
@@ -414,77 +408,3 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
                 "give each access domain its own ros.domainId"
             )
             yield fault("", message).within(config.file_of(DOMAINS_FILE, next(iter(names))))
-
-
-def _kinds_of_charts(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each kind that a domain refuses, or that cannot be read."""
-    # A chart may run in an access domain that has no rules, or in which a rule allows an
-    # application that uses the chart.
-    domains_of: dict[str, list[AccessDomain]] = {}
-    for appdef, services in config.services.items():
-        allowing = [
-            domain
-            for domain in config.domains.values()
-            if not domain.rules or any(matches(appdef, rule.applications) for rule in domain.rules)
-        ]
-        for service in services.values():
-            for source in config.charts[service.chart].sources():
-                top = source.folder
-                for folder in charts.folders(top, config.files) if top else ():
-                    domains = domains_of.setdefault(folder, [])
-                    domains += [domain for domain in allowing if domain not in domains]
-    paths = sorted(config.files)
-    for folder, domains in sorted(domains_of.items()):
-        for chart in charts.dependencies(folder, config.files):
-            if (
-                chart.folder is None
-                and f"{folder}/charts/{chart.name}/Chart.yaml" not in config.files
-            ):
-                message = (
-                    f"subchart {quoted(chart.name)} is not unpacked in charts/, so the kinds of "
-                    "its objects are not known; check yourself that the access domain allows these "
-                    "kinds"
-                )
-                yield fault(f"dependencies[{chart.index}]", message).within(f"{folder}/Chart.yaml")
-        for path in charts.below(folder, paths):
-            name = path.removeprefix(f"{folder}/")
-            if _CRDS.fullmatch(name):
-                yield from _refused(path, None, "CustomResourceDefinition", domains, config)
-            elif _TEMPLATE.fullmatch(name):
-                # A pull request of a stranger may have a template with any number of kinds.
-                faults = _template(path, config.files[path], domains, config)
-                shown = [*islice(faults, MOST_FAULTS + 1)]
-                yield from shown[:MOST_FAULTS]
-                if len(shown) > MOST_FAULTS:
-                    yield Fault("more", "", "has more objects of such kinds", path)
-
-
-def _template(path: str, text: str, domains: list[AccessDomain], config: Config) -> Iterator[Fault]:
-    for line, words in enumerate(text.split("\n"), start=1):
-        match = _KIND.match(words)
-        if match is None:
-            continue
-        value = match["kind"].strip()
-        plain = _PLAIN.fullmatch(value)
-        if plain:
-            yield from _refused(path, line, plain[1], domains, config)
-        else:
-            message = (
-                f"the template computes the kind {quoted(value)}; check yourself that the access "
-                "domain allows it"
-            )
-            yield fault("", message, line=line).within(path)
-
-
-def _refused(
-    path: str, line: int | None, kind: str, domains: list[AccessDomain], config: Config
-) -> Iterator[Fault]:
-    for domain in domains:
-        if kind not in {allowed.kind for allowed in domain.allowed_kinds}:
-            remedy = domain.how_to_allow(kind, config.file_of(DOMAINS_FILE, domain.name))
-            message = (
-                f"{kind} is not among the kinds of access domain '{domain.name}', so the cluster "
-                f"refuses such an object if the chart renders one; {remedy}, or remove the object "
-                "from the chart"
-            )
-            yield fault("", message, line=line).within(path)

@@ -11,18 +11,17 @@ only what changed since.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
-import select
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from math import inf
 from pathlib import Path
 from types import MappingProxyType
@@ -40,7 +39,6 @@ DEMAND_S = 0.5
 MEMORY_MIB = 512
 _MOST_IDLE = 2  # the worker's and the page's
 _LONGEST_ANSWER = 64_000_000
-_PIPE = 1 << 20  # the most that Linux gives everybody
 # Waiting for an answer is bounded too, in case the child is stopped. A busy machine runs it slowly.
 _LONGEST_WAIT_S = 60
 _START = (
@@ -56,6 +54,9 @@ class _Limits:
     each: float
     left: float
     meanwhile: Callable[[], object] = lambda: None
+    # A file that took too long for one release is not tried for others, as long as no file changes
+    files: Mapping[str, str] = field(default_factory=dict)
+    late: dict[str, OverLimit] = field(default_factory=dict)
 
 
 _limits: ContextVar[_Limits] = ContextVar("limits")
@@ -85,6 +86,10 @@ class Evaluator:
     def __call__(self, files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[str, Any]:
         limits = _limits.get(None) or _Limits(2, inf)
         limits.meanwhile()
+        if files is not limits.files:
+            limits.files, limits.late = files, {}
+        if task.file in limits.late:
+            raise limits.late[task.file]
         seconds = min(limits.each, limits.left)
         if seconds <= 0:
             raise _over(task, "the evaluations before it took all the time of this demand")
@@ -100,7 +105,8 @@ class Evaluator:
                 # somebody may have ended an idle child, or it kept much of earlier evaluations
                 if is_fresh or death.is_late:
                     limits.left -= seconds if death.is_late else 0
-                    raise _over(task, str(death)) from None
+                    limits.late[task.file] = _over(task, str(death))
+                    raise limits.late[task.file] from None
             except BaseException:
                 child.kill()  # its answer was not read, so the next one would be taken for it
                 raise
@@ -139,21 +145,18 @@ class _Died(Exception):
 class _Child:
     def __init__(self) -> None:
         package = str(Path(__file__).parents[2])
-        # -S leaves out what packages run at each start; the path has all that it would add
-        self._process = subprocess.Popen(
-            [sys.executable, "-s", "-S", "-c", _START, json.dumps([package, *sys.path])],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            cwd="/",
-            env={"LC_ALL": "C.UTF-8", "PYTHONHASHSEED": "0"},
-            start_new_session=True,  # ctrl-c ends this process, which then ends the child
-        )
-        assert self._process.stdin is not None  # noqa: S101
-        os.set_blocking(self._process.stdin.fileno(), False)  # a stopped child reads nothing
-        # so that one write is enough; without room for the larger pipe, more writes do as well
-        with suppress(OSError, AttributeError):
-            fcntl.fcntl(self._process.stdin.fileno(), fcntl.F_SETPIPE_SZ, _PIPE)
+        self._socket, theirs = socket.socketpair()
+        with theirs:
+            # -S leaves out what packages run at each start; the path has all that it would add
+            self._process = subprocess.Popen(
+                [sys.executable, "-s", "-S", "-c", _START, json.dumps([package, *sys.path])],
+                stdin=theirs.fileno(),
+                stdout=theirs.fileno(),
+                stderr=subprocess.DEVNULL,
+                cwd="/",
+                env={"LC_ALL": "C.UTF-8", "PYTHONHASHSEED": "0"},
+                start_new_session=True,  # ctrl-c ends this process, which then ends the child
+            )
         self._files: Mapping[str, str] = MappingProxyType({})
 
     def answer(
@@ -170,50 +173,33 @@ class _Child:
         # encode.
         head = {"files": changed, "seconds": seconds}
         lines = (json.dumps(line, default=dict) + "\n" for line in (head, parts))
-        question = "".join(lines).encode("ascii")
-        stdin, stdout = self._process.stdin, self._process.stdout
-        assert stdin is not None and stdout is not None  # noqa: S101 - both are pipes
-        unsent = memoryview(question)
-        with suppress(BrokenPipeError):  # the child ended, as reading will show
-            while unsent:
-                self._wait(stdin.fileno(), select.POLLOUT, seconds)
-                unsent = unsent[os.write(stdin.fileno(), unsent) :]
-        pieces, length = list[bytes](), 0
-        while not pieces or not pieces[-1].endswith(b"\n"):
-            self._wait(stdout.fileno(), select.POLLIN, seconds)
-            piece = os.read(stdout.fileno(), 1_000_000)
-            length += len(piece)
-            if length > _LONGEST_ANSWER:
-                self.kill()
-                raise _Died(f"gives more than {_LONGEST_ANSWER} characters")
-            if not piece:
-                status = self._process.wait()
-                self._close()
-                if status == -signal.SIGPROF:  # the timer that the child sets
-                    reason = f"takes more than {seconds:.3g} s of processor time"
-                    raise _Died(reason, is_late=True)
-                raise _Died(f"takes more than {MEMORY_MIB} MiB of memory, or is nested too deeply")
-            pieces.append(piece)
-        answer: dict[str, Any] = json.loads(b"".join(pieces))
-        return answer
-
-    def _wait(self, descriptor: int, event: int, seconds: float) -> None:
-        waiting = select.poll()
-        waiting.register(descriptor, event)
-        if not waiting.poll((_LONGEST_WAIT_S + 20 * seconds) * 1000):
+        answer = bytearray()
+        self._socket.settimeout(_LONGEST_WAIT_S + 20 * seconds)
+        try:
+            self._socket.sendall("".join(lines).encode("ascii"))
+            while not answer.endswith(b"\n") and (piece := self._socket.recv(1_000_000)):
+                answer += piece
+                if len(answer) > _LONGEST_ANSWER:
+                    self.kill()
+                    raise _Died(f"gives more than {_LONGEST_ANSWER} characters")
+        except TimeoutError:
             self.kill()
-            raise _Died("gave no answer for a long time", is_late=True)
+            raise _Died("gave no answer for a long time", is_late=True) from None
+        except ConnectionError:  # the child ended
+            answer.clear()
+        if not answer.endswith(b"\n"):
+            self._socket.close()
+            if self._process.wait() == -signal.SIGPROF:  # the timer that the child sets
+                reason = f"takes more than {seconds:.3g} s of processor time"
+                raise _Died(reason, is_late=True)
+            raise _Died(f"takes more than {MEMORY_MIB} MiB of memory, or is nested too deeply")
+        read: dict[str, Any] = json.loads(answer)
+        return read
 
     def kill(self) -> None:
         self._process.kill()
         self._process.wait()
-        self._close()
-
-    def _close(self) -> None:
-        for pipe in (self._process.stdin, self._process.stdout):
-            with suppress(OSError):  # what was not sent yet
-                if pipe:
-                    pipe.close()
+        self._socket.close()
 
 
 EVALUATE = Evaluator()

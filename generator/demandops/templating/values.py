@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+import fnmatch
+import glob
 import json
 import re
 import traceback
 from collections.abc import Callable, ItemsView, Iterable, Iterator, KeysView, Mapping, ValuesView
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache, wraps
+from functools import lru_cache
 from typing import Any
 
 import jsonschema_rs
-from jinja2 import FunctionLoader, TemplateError, nodes
+from jinja2 import FunctionLoader, TemplateError
 from jinja2.exceptions import SecurityError, TemplateNotFound, TemplateSyntaxError
-from jinja2.runtime import Context, Undefined
+from jinja2.runtime import Context
 from jinja2.sandbox import ImmutableSandboxedEnvironment
-from jinja2.visitor import NodeTransformer
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path
 from demandops.base.quoting import quoted
-from demandops.base.strict_yaml import not_writable
 from demandops.templating import charts
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
 
@@ -56,23 +56,15 @@ def with_template_lines(faults: Iterable[Fault], template: str, rendered: str) -
 
 def _may_write(line: str, rendered: str) -> bool:
     # whether `rendered` has all text around the expressions of the template's line
-    first, *others = _EXPRESSION.split(line)
-    if not others or not "".join((first, *others)).strip() or not rendered.startswith(first):
-        return False
-    at, end = len(first), len(rendered) - len(others[-1])
-    for part in others[:-1]:
-        at = rendered.find(part, at)
-        if at < 0:
-            return False
-        at += len(part)
-    return at <= end and rendered.endswith(others[-1])
+    parts = _EXPRESSION.split(line)
+    pattern = fnmatch.translate("*".join(map(glob.escape, parts)))
+    return len(parts) > 1 and bool("".join(parts).strip()) and bool(re.match(pattern, rendered))
 
 
 # ---- a Jinja sandbox in which a template gives the same text in every process ----
 #
 # Templates can use only the filters and methods listed here, and the engine's own filters. Many of
-# the others give random results or make HTML. Nothing that is no data becomes text, because the
-# text of a method, say, has an address of memory. How long a template runs and how large its values
+# the others give random results or make HTML. How long a template runs and how large its values
 # become is not the sandbox's matter: it runs in a process with limits (:mod:`.evaluator`).
 
 _FILTERS = re.findall(
@@ -94,76 +86,28 @@ _METHODS: dict[type, list[str]] = {
     tuple: ["count", "index"],
 }
 _BUILT_IN = (str, int, float, bytes, dict, list, tuple, range)
-_VIEWS = (KeysView, ItemsView, ValuesView)
-# the text of StrictUndefined is an error of its own, which names what is missing
-_PLAIN = (str, int, float, type(None), range, Undefined)
-
-
-def _as_data(value: Any) -> Any:  # noqa: ANN401
-    """Return a value, an iterator or view as a list; raise SecurityError if a part is no data."""
-    if isinstance(value, (Iterator, *_VIEWS)):
-        value = list(value)
-    parts = [value]
-    while parts:
-        part = parts.pop()
-        if isinstance(part, (list, tuple, *_VIEWS)):
-            parts.extend(part)
-        elif isinstance(part, Mapping):
-            parts.extend(part)
-            parts.extend(part.values())
-        elif not isinstance(part, _PLAIN):
-            raise SecurityError(not_writable(part))
-    return value
-
-
-@lru_cache(maxsize=256)  # each rendering has a sandbox, but all have the same filters
-def _of_data(function: Callable[..., Any]) -> Callable[..., Any]:
-    passed = 1 if hasattr(function, "jinja_pass_arg") else 0
-
-    @wraps(function)
-    def checked(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
-        named = {name: _as_data(value) for name, value in kwargs.items()}
-        return function(*args[:passed], *map(_as_data, args[passed:]), **named)
-
-    return checked
-
-
-def _concatenated(parts: list[Any]) -> str:
-    return "".join(map(str, parts))
-
-
-# `~` makes text of anything, so a filter takes its place, whose operands must be data
-class _Concatenations(NodeTransformer):
-    def __init__(self, environment: Sandbox) -> None:
-        self._environment = environment
-
-    def visit_Concat(self, node: nodes.Concat) -> nodes.Filter:
-        self.generic_visit(node)
-        operands = nodes.List(node.nodes, lineno=node.lineno)
-        place = {"lineno": node.lineno, "environment": self._environment}
-        return nodes.Filter(operands, "_concatenated", [], [], None, None, **place)
+# Where the text of something that is no data has an address of memory, as that of a method has
+_ADDRESS = re.compile(" at 0x[0-9a-f]+")
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    intercepted_binops = frozenset({"%"})  # the format `%s` would write anything as text
-
     def __init__(self, filters: Mapping[str, Callable[..., Any]], **options: Any) -> None:  # noqa: ANN401
         super().__init__(**options)
         finalize = self.finalize
         assert finalize is not None  # noqa: S101 - our own options
-        self.finalize = lambda value: finalize(_as_data(value))
-        listed = {name: self.filters[name] for name in _FILTERS}
-        allowed = {**listed, **filters, "_concatenated": _concatenated}
-        self.filters = {name: _of_data(function) for name, function in allowed.items()}
+
+        def written(value: object) -> object:
+            if isinstance(value, (Iterator, KeysView, ItemsView, ValuesView)):
+                value = [*value]
+            text = finalize(value)
+            if _ADDRESS.search(str(text)):
+                raise SecurityError("a template may write only data, and no function or method")
+            return text
+
+        self.finalize = written
+        self.filters = {**{name: self.filters[name] for name in _FILTERS}, **filters}
         del self.tests["sameas"]  # whether two values are one object is an accident
         del self.globals["lipsum"]  # writes random text
-
-    def _parse(self, source: str, name: str | None, filename: str | None) -> nodes.Template:
-        tree: nodes.Template = _Concatenations(self).visit(super()._parse(source, name, filename))
-        return tree
-
-    def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:  # noqa: ANN401
-        return super().call_binop(context, operator, left, _as_data(right))
 
     def call(__self, __context: Context, __obj: Any, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
         owner = getattr(__obj, "__self__", None)
@@ -171,10 +115,6 @@ class Sandbox(ImmutableSandboxedEnvironment):
             if isinstance(owner, kind) and __obj.__name__ not in _METHODS.get(kind, ()):
                 raise SecurityError(f"a template may not call the method '{__obj.__name__}'")
         return super().call(__context, __obj, *args, **kwargs)
-
-    def wrap_str_format(self, value: Any) -> Callable[..., str] | None:  # noqa: ANN401
-        wrapped = super().wrap_str_format(value)
-        return _of_data(wrapped) if wrapped else None
 
 
 # ---- the Helm values of a service: from a values template, a chart and overrides ----
@@ -186,7 +126,6 @@ class Sandbox(ImmutableSandboxedEnvironment):
 
 _MAX_LENGTH = 100_000  # characters of a values template
 _MAX_RENDERED = 1_000_000  # characters that it writes; Kubernetes takes objects of 1.5 MB
-_ADDRESS = re.compile(" at 0x[0-9a-f]+")
 _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -143,6 +144,21 @@ def _names(key: str, title: str, rank: int, links: str = "", *, wide: bool = Fal
     return Column(key, title, rank, links=links, only_wide=wide)
 
 
+def _command(title: str, words_of: Callable[[Json], list[str]]) -> Column:
+    return Column(
+        "name",
+        title,
+        9,
+        "command",
+        lambda item, now: shlex.join(words_of(item)),
+        only_wide=True,
+    )
+
+
+def _decide(proposal: Json, verb: str) -> list[str]:
+    return ["demandops", verb, proposal["name"], "--commit", proposal["commit"]]
+
+
 def _holds(item: Json, now: datetime) -> list[str]:
     return [*item["applications"], *item["connections"]]
 
@@ -206,7 +222,8 @@ def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
 
 
 def _demands(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    for id, claims in source.claims_of_demands.items():
+    held = source.claims_of_demands.items()
+    for id, claims in sorted(held, key=lambda pair: (min(c.booked for c in pair[1]), pair[0])):
         releases = source.releases_of_demands.get(id, [])
         yield id, (claims, _state(source, claims), releases, _health(source, releases))
     for waiting in source.state.ledger.waiting.values():
@@ -859,6 +876,7 @@ KINDS: dict[str, Kind] = {
                 Column("releases", "To", 5, texts_of=_affected),
                 Column("reason", "Reason", 6),
                 Column("priority", "Priority", 9, only_wide=True),
+                _command("End it", lambda item: ["demandops", "override", "end", item["name"]]),
             ),
             _overrides,
             _override,
@@ -883,6 +901,9 @@ KINDS: dict[str, Kind] = {
                 Column("required_by", "Required by", 4),
                 Column("link", "Link", 5),
                 _names("demands", "Demands", 9, "demand", wide=True),
+                _command("See", lambda item: ["git", "diff", f"origin/main...{item['commit']}"]),
+                _command("Approve", lambda item: _decide(item, "approve")),
+                _command("Refuse", lambda item: _decide(item, "reject")),
             ),
             _proposals,
         ),

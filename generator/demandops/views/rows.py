@@ -37,7 +37,7 @@ class Column:
     title: str
     # A narrow terminal leaves out the columns of the highest ranks, never one of rank 0.
     rank: int = 0
-    form: Literal["text", "time", "state"] = "text"
+    form: Literal["text", "time", "state", "command"] = "text"
     texts_of: TextsOf | None = None  # by default the item's value
     links: str = ""  # the kind of thing that its texts name
     only_wide: bool = False

@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 
 from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
+from demandops.views.kinds import rows_of
+from demandops.views.rows import Filter, Row
 from demandops.views.source import RANKS, WORDS, Source, word_of
-from demandops.web.lists import Filter, Row, rows_of
 
 # ---- the layout: nodes are drawn at their positions, or by cluster and type ----
 
@@ -183,7 +184,7 @@ def picture(now: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     config = now.config
     nodes = list(config.nodes.values())
     rows = rows_of(now, "services") if wanted else []
-    lit_services = {row.cells["release"].parts[0].text for row in rows if wanted.matches(row)}
+    lit_services = {row.item["name"] for row in rows if wanted.matches(row)}
     marks: dict[str, list[ServiceMark]] = {id: [] for id in config.nodes}
     for release, _ in now.targets:
         if isinstance(release, ServiceRelease) and release.node.id in marks:
@@ -202,9 +203,9 @@ def picture(now: Source, wanted: Filter, layout: str) -> dict[str, Any]:
         lit = {id for id, on_node in marks.items() if any(mark.is_lit for mark in on_node)}
         for row in rows_of(now, "connections"):
             if wanted.matches(row):
-                lit.update(row.hidden["node"])
+                lit.update(row.item["nodes"])
         own = ({"node": [n.id], "type": [n.type], "cluster": [n.cluster]} for n in nodes)
-        lit.update(texts["node"][0] for texts in own if wanted.matches(Row({}, texts)))
+        lit.update(texts["node"][0] for texts in own if wanted.matches(Row(texts)))
         lit &= marks.keys()
     only_lit = len(nodes) > _MOST_NAMED and 0 < len(lit) <= _MOST_NAMED
     if only_lit:
@@ -285,15 +286,15 @@ def _lines(now: Source, wanted: Filter, cards: Mapping[str, NodeCard]) -> list[L
     # lit lines come last, on top
     pairs: dict[tuple[str, str], list[Row]] = {}
     for row in rows_of(now, "connections"):
-        ends = row.hidden["node"]
+        ends = row.item["nodes"]
         if all(end in cards for end in ends):
             pairs.setdefault((ends[0], ends[1]), []).append(row)
     lines = []
     for (source, target), rows in pairs.items():
-        words = [row.cells["health"].parts[0].text for row in rows]
+        words = [row.item["health"] or "unknown" for row in rows]
         worst = min(words, key=RANKS.__getitem__)
-        topics = sum(len(row.cells["topic"].parts) for row in rows)
-        names = ", ".join(row.cells["connection"].parts[0].text for row in rows[:3])
+        topics = sum(len(row.item["topics"]) for row in rows)
+        names = ", ".join(row.item["name"] for row in rows[:3])
         title = f"{source} to {target}: {names}, {topics} topics, {worst}"
         is_lit = bool(wanted) and any(wanted.matches(row) for row in rows)
         path = cards[source].curve_to(cards[target])

@@ -19,8 +19,9 @@ from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import GENERATOR_NAME
 from demandops.views import release_causes
+from demandops.views.rows import Filter, Row, exactly
 from demandops.views.source import Source, since_of, word_of, worst_word
-from demandops.web.lists import Cell, Filter, Part, Row, cell, exactly
+from demandops.web.lists import Part
 
 # ---- who can probably fix a release that is not ready ----
 
@@ -136,7 +137,7 @@ class Cause:
             "requester": self.requesters,
             "demand": self.demands,
         }
-        return Row({"what": Cell((self.what,)), "why": cell(self.why, self.told)}, texts)
+        return Row({"what": [self.what.text], "why": [self.why, self.told], **texts})
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +179,7 @@ def applications(now: Source, causes: Iterable[Cause], wanted: Filter) -> list[R
     shown = []
     for application, claims in sorted(claims_of.items()):
         texts = {"requester": requesters_of(claims), "demand": [claim.demand for claim in claims]}
-        row = Row({"application": cell(application)}, texts)
+        row = Row({"application": [application], **texts})
         if wanted.matches(row):
             its_causes = tuple(by_application.get(application, ()))
             word = worst_word(statuses.get(application, ()))
@@ -284,7 +285,7 @@ def _awaited(now: Source, not_rendered: list[str]) -> Iterator[Cause]:
     for proposal in now.proposals:
         yield Cause(
             "decision",
-            Part(proposal.summary, "overrides"),
+            Part(proposal.summary, "proposals"),
             "awaits a person's approval",
             "a person who may merge to main",
             "merge the branch to approve the demand, or delete the branch to refuse it",

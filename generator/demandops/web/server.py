@@ -32,10 +32,12 @@ from demandops.base.quoting import escaped, lines
 from demandops.model.config.base_model import relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
+from demandops.views.kinds import KINDS, rows_of
+from demandops.views.rows import Filter, exactly, page_of, sorted_rows
 from demandops.views.source import WORDS, Source
-from demandops.web import fleet_map, lists, not_ready, time_line
+from demandops.web import fleet_map, not_ready, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
-from demandops.web.lists import LISTS, Filter, Part, Row, rows_of
+from demandops.web.lists import LISTS, PAGE, Part, cells_of
 from demandops.web.release_view import explained_demand, explained_release
 
 # ---- the views, by address ----
@@ -46,9 +48,8 @@ _KEPT = ("at", "q")
 NAVIGATION = (
     ("", "Not ready"),
     ("map", "Map"),
-    *((name, kind.title) for name, kind in LISTS.items()),
+    *((name, KINDS[name].title) for name in LISTS),
     ("timeline", "Time line"),
-    ("overrides", "Overrides"),
     ("rates", "Rates"),
 )
 
@@ -101,16 +102,20 @@ def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _list(asked: ViewRequest) -> tuple[str, Data]:
-    kind, sort = LISTS[asked.path], asked.get("sort")  # `-` before a key is the reverse order
+    kind, now, sort = KINDS[asked.path], asked.source.now, asked.get("sort")
     rows = rows_of(asked.source, asked.path)
     matching = [row for row in rows if asked.filter.matches(row)]
-    if (key := sort.removeprefix("-")) not in kind.columns:
-        sort = key = next(iter(kind.columns))
-    matching.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
-    shown, page, pages = lists.page_of(matching, asked.page(), lists.PAGE)
+    columns = {column.key: column for column in kind.columns if not column.only_wide}
+    if (key := sort.removeprefix("-")) in columns:  # `-` before a key is the reverse order
+        matching = sorted_rows(matching, columns[key], now, down=sort.startswith("-"))
+    shown, page, pages = page_of(matching, asked.page(), PAGE)
+    cells = [cells_of(kind, row, now) for row in shown]
+    # of the columns that only some rows fill, those that a shown row fills
+    used = {cell.column.key for each in cells for cell in each if cell.parts}
     return "list.html.j2", {
         "kind": kind,
-        "rows": shown,
+        "columns": [c for key, c in columns.items() if key in used or not shown],
+        "rows": cells,
         "total": len(rows),
         "matching": len(matching),
         "sort": sort,
@@ -131,7 +136,7 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     changed: list[str] = []
     if asked.get("at"):
         changed = asked.follower.reader().files_changed_by(now.commit)
-    shown, page, pages = lists.page_of(events, asked.page(), size=50)
+    shown, page, pages = page_of(events, asked.page(), size=50)
     return "timeline.html.j2", {
         "strip": time_line.strip(events, now.now, asked.get("span"), chosen),
         "lanes": time_line.LANES,
@@ -144,21 +149,6 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
         "changed": changed,
         "is_cut": len(asked.follower.history) >= MOST_COMMITS,
     }
-
-
-def _overrides(asked: ViewRequest) -> tuple[str, Data]:
-    entries = []
-    for entry in asked.source.overrides:
-        texts = {
-            "owner": [entry.override.owner],
-            "reason": [entry.override.reason],
-            "release": [release.name for release in entry.releases],
-            "demand": [claim.demand for claim in entry.claims],
-            "requester": [who for claim in entry.claims for who in claim.requesters],
-        }
-        if asked.filter.matches(Row({"override": lists.cell(entry.override.name)}, texts)):
-            entries.append(entry)
-    return "overrides.html.j2", {"entries": entries}
 
 
 def _rates(asked: ViewRequest) -> tuple[str, Data]:
@@ -180,7 +170,7 @@ VIEWS: Mapping[str, View] = {
         "map.html.j2",
         {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
     ),
-    **{f"/{name}": _list for name in LISTS},
+    **{f"/{name}": _list for name in (*LISTS, "services")},
     "/demand": lambda asked: (
         "demand.html.j2",
         {"demand": explained_demand(asked.source, asked.follower.reader(), asked.get("id"))},
@@ -190,7 +180,6 @@ VIEWS: Mapping[str, View] = {
         {"release": explained_release(asked.source, asked.follower.reader(), asked.get("name"))},
     ),
     "/timeline": _timeline,
-    "/overrides": _overrides,
     "/rates": _rates,
 }
 
@@ -307,7 +296,7 @@ class Site:
                     "here": asked,
                     "now": asked.source.now,
                     "source": asked.source,
-                    "exactly": lists.exactly,
+                    "exactly": exactly,
                     "program": __version__,
                     "has_docs": self._has_docs,
                     "version": version,

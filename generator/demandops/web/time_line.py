@@ -13,8 +13,8 @@ from typing import Any
 from demandops.model.config.base_model import span
 from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.repo.history.commit_message import PROPOSAL
+from demandops.views.rows import Row
 from demandops.views.source import WORDS, Commit, HealthChange
-from demandops.web.lists import Row, cell
 
 # ---- the time line of events ----
 
@@ -59,8 +59,14 @@ class Event:
 
     def row(self) -> Row:
         return Row(
-            {"lane": cell(self.lane), "word": cell(self.word), "summary": cell(self.summary)},
-            {"who": [self.who], "commit": [self.commit], "release": [self.release]},
+            {
+                "lane": [self.lane],
+                "word": [self.word],
+                "summary": [self.summary],
+                "who": [self.who],
+                "commit": [self.commit],
+                "release": [self.release],
+            }
         )
 
 

@@ -12,10 +12,11 @@ import pytest
 import yaml
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
+from demandops.views.rows import Filter
 from demandops.views.source import Source
 from demandops.web import not_ready
 from demandops.web.follower import Follower
-from demandops.web.lists import Filter
+from demandops.web.lists import LISTS
 from demandops.web.server import Site
 from starlette.testclient import TestClient
 
@@ -23,8 +24,7 @@ from tests.kit import goals
 from tests.kit.generator import book, running, wait_until
 from tests.kit.html import Page
 
-VIEWS = ("/", "/map", "/demands", "/services", "/connections", "/leases", "/timeline",
-         "/overrides", "/rates")  # fmt: skip
+VIEWS = ("/", "/map", "/services", "/timeline", "/rates", *(f"/{name}" for name in LISTS))
 DENY = """apiVersion: demandops/v1
 kind: Override
 reason: The road is closed

@@ -53,9 +53,6 @@ class RelayType(ConnectionType):
         if target is not None and target.wan is None:
             yield fault("target", f"'{target.id}' has no wan; add it in {NODES_FILE}")
 
-    def shares_clients(self, config: Config) -> bool:
-        return True
-
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
         return (ClientKey(self, target),)
 

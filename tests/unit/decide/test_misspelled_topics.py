@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from demandops.decide import warnings
 
 from tests.kit import plain_yaml
-from tests.kit.goals import CLOUD, put
+from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
 
@@ -27,13 +26,3 @@ def test_it_is_told_with_the_topic_of_the_inventory_or_of_an_earlier_demand(
     told = f"'{source}' is not known to publish {topic}; did you mean '{meant}'?"
     warned = [text for text in decision.warnings if "did you mean" in text]
     assert [told in text for text in warned] == [True] * bool(meant)
-
-
-def test_check_tells_of_it_with_the_file_of_the_claim() -> None:
-    books = MemoryRepo()
-    link = {"id": "own/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
-    link |= {"topics": [{"source": CLOUD[0].replace("vehicles", "vehicle")}]}
-    books.send(put("own", "own", applications=[], connections=[link]))
-    (found,) = warnings.misspelled_topic_warnings(books.state)
-    assert found.file.startswith("ledger/connections/")
-    assert f"did you mean '{CLOUD[0]}'?" in found.message

@@ -45,19 +45,3 @@ def test_notes_are_passed_over_and_a_sound_override_is_taken() -> None:
     notes = {"overrides/README.md": "hello", "overrides/.gitkeep": ""}
     config = load(files({"overrides/a.yaml": {}}) | notes)
     assert [one.path for one in World(config, Ledger()).overrides] == ["overrides/a.yaml"]
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        {"priority": 1},
-        {"replicas": 2},
-        {"replicas": None, "values": {"a": 1}},
-        {"select": [{"services": ["object-fusion"]}]},
-        {"replicas": None, "deny": True},
-    ],
-    ids=str,
-)
-def test_no_tie_where_it_does_not_matter_who_comes_last(other: dict[str, Any]) -> None:
-    config = load(files({"overrides/one.yaml": {}, "overrides/two.yaml": {"replicas": 3} | other}))
-    assert len(World(config, Ledger()).overrides) == 2

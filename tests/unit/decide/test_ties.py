@@ -1,107 +1,26 @@
-"""A configuration is valid only if no result depends on the order of overrides of equal priority.
-
-The tests compare random selectors with every possible release.
-"""
+"""Overrides of equal priority: who is warned, and what patches make of Helm values."""
 
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from itertools import product
 from json import dumps
 from typing import Any
 
 import pytest
 from demandops.decide.changeset import trial_releases
-from demandops.decide.planning.overrides import Traits, apply_effects, effects_on, fits
-from demandops.model.config.cross_check import patterns_overlap
-from demandops.model.config.override import Override, OverrideFile, Selector
-from demandops.model.config.policy import matches
+from demandops.decide.planning.overrides import apply_effects, effects_on
+from demandops.decide.warnings import tied_override_warnings
+from demandops.model.config.override import Override, OverrideFile
 from demandops.model.release import ServiceRelease
 from demandops.templating.charts import merged, overridden
-from hypothesis import example, given
+from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import contested_effects, may_select_same_release, patches_commute
+from tests.kit.config import patches_commute
 from tests.kit.memory import MemoryRepo
 
-TEXTS = ["".join(chars) for size in range(7) for chars in product("ab", repeat=size)]
-pattern = st.text("ab*?", min_size=1, max_size=4)
-
-
-@given(pattern, pattern)
-@example("a*b", "*")
-@example("*a*", "b?b*")
-@example("?", "ab")
-def test_patterns_overlap_just_where_some_text_fits_both(one: str, other: str) -> None:
-    both = any(matches(text, (one,)) and matches(text, (other,)) for text in TEXTS)
-    assert patterns_overlap(one, other) is both
-    assert patterns_overlap(other, one) is both
-
-
 CONFIG = MemoryRepo().config
-IDS = ["a", "b", "ab"]
-SOME = [("a",), ("b",), ("a", "b")]
-NODES = ["edge", "cloud"]
-SHARED, OWN, APPDEF = "object-detection", "object-fusion", "object-detection-fusion"
-
-
-def _releases() -> list[Traits]:
-    """Return the traits of every possible release in a world with few names."""
-    found = []
-    for node, who in product(NODES, SOME):
-        found += [Traits((node,), who, (id,), (APPDEF,), service=OWN) for id in IDS]
-        found += [Traits((node,), who, ids, (APPDEF,), service=SHARED) for ids in SOME]
-        found += [Traits((node,), who, connections=(id,)) for id in IDS]
-    return found
-
-
-RELEASES = _releases()
-patterns = st.lists(st.sampled_from(["a", "b", "a*", "*b", "?", "*"]), min_size=1, max_size=2)
-fields = st.fixed_dictionaries(
-    {},
-    optional={
-        "applications": patterns,
-        "appdefs": st.lists(st.sampled_from([APPDEF, "other", "*"]), min_size=1, max_size=1),
-        "services": st.lists(st.sampled_from([SHARED, OWN, "object-*"]), min_size=1, max_size=1),
-        "nodes": st.lists(st.sampled_from(["edge", "cloud", "e*", "*"]), min_size=1, max_size=2),
-        "requesters": patterns,
-        "labels": st.sampled_from([{"node_id": "edge"}, {"node_id": "cloud"}, {"other": "x"}]),
-    },
-) | st.fixed_dictionaries(
-    {"connections": patterns},
-    optional={"nodes": st.just(["edge"]), "requesters": patterns},
-)
-selector = fields.filter(bool).map(Selector.model_validate)
-
-
-@given(st.lists(selector, min_size=1, max_size=2), st.lists(selector, min_size=1, max_size=2))
-@examples(60)
-def test_selectors_that_cannot_meet_never_do(one: list[Selector], other: list[Selector]) -> None:
-    if may_select_same_release(one, other, CONFIG):
-        return
-    assert not may_select_same_release(other, one, CONFIG)
-    for traits in RELEASES:
-        hit = [any(fits(s, traits, CONFIG) for s in side) for side in (one, other)]
-        assert not all(hit), traits
-
-
-@pytest.mark.parametrize(
-    ("pair", "meet"),
-    [
-        (pair, name == "together")
-        for name, pairs in plain_yaml.beside(__file__).items()
-        for pair in pairs
-    ],
-    ids=str,
-)
-def test_selectors_that_differ_in_a_single_valued_trait_never_meet(
-    pair: list[dict[str, Any]], meet: bool
-) -> None:
-    one, other = (Selector.model_validate(fields) for fields in pair)
-    assert may_select_same_release([one], [other], CONFIG) is meet
-
 
 json = st.recursive(
     st.none() | st.booleans() | st.integers(0, 2) | st.sampled_from("xy"),
@@ -199,15 +118,38 @@ def _release() -> ServiceRelease:
 
 @given(effects, effects)
 @examples(60)
-def test_uncontested_overrides_give_the_same_result_in_either_order(
+def test_a_tie_is_told_where_the_order_of_names_decides(
     one: dict[str, Any], other: dict[str, Any]
 ) -> None:
     both = [_override(name, fields) for name, fields in (("one", one), ("other", other))]
-    if contested_effects(*both):
-        assert contested_effects(both[1], both[0])
-        return
     first, second = (_shaped(order) for order in (both, both[::-1]))
-    assert first == second
+    told = [*tied_override_warnings([first])]
+    assert bool(told) is bool([*tied_override_warnings([second])])
+    if not told:
+        assert _made(first) == _made(second)
+    else:
+        assert {(each.file, each.field) for each in told} == {("overrides/other.yaml", "priority")}
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "tied"),
+    [
+        ({"replicas": 1}, {"replicas": 2}, True),
+        ({"replicas": 1}, {"replicas": 1}, False),
+        ({"replicas": 1}, {"replicas": 2, "priority": 1}, False),
+        ({"replicas": 1}, {"node": "cloud"}, False),
+        ({"values": {"k": 1}}, {"values": {"k": True}}, True),
+        ({"values": {"k": {"a": 1}}}, {"values": {"k": {"b": 1}}}, False),
+        ({"hold": True}, {"replicas": 2}, True),
+        ({"hold": True}, {"hold": True}, False),
+    ],
+    ids=str,
+)
+def test_overrides_are_tied_if_they_differ_in_what_both_set(
+    one: dict[str, Any], other: dict[str, Any], tied: bool
+) -> None:
+    release = _shaped([_override("one", one), _override("other", other)])
+    assert bool([*tied_override_warnings([release])]) is tied
 
 
 def _override(name: str, fields: dict[str, Any]) -> Override:
@@ -216,13 +158,17 @@ def _override(name: str, fields: dict[str, Any]) -> Override:
     return Override.from_file(name, file)
 
 
-def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
+def _shaped(overrides: list[Override]) -> ServiceRelease:
     release = _release()
     by = [(one, effects_on(release, one, CONFIG)) for one in overrides]
     shaped = apply_effects(release, [pair for pair in by if pair[1]], CONFIG)
     assert isinstance(shaped, ServiceRelease)
+    return shaped
+
+
+def _made(shaped: ServiceRelease) -> tuple[Any, ...]:
     values: Any = {}
     for _, patch in shaped.shaping.patches:
         values = overridden(values, patch, None)
-    images = {name: shaped.image(name, CONFIG) for name in release.service.images}
+    images = {name: shaped.image(name, CONFIG) for name in shaped.service.images}
     return shaped.replicas, shaped.node, shaped.shaping.held, _text(values), images

@@ -31,13 +31,6 @@ def test_exactly_what_is_listed_is_warned_of(name: str) -> None:
         assert words in one
 
 
-def test_the_warning_of_the_documentation_is_told() -> None:
-    page = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
-    (one,) = told(CASES["a kind that the domain lacks, with its line"])
-    one = one.replace("object-detection-fusion", "agent").replace("object-detection", "agent")
-    assert one in page
-
-
 def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
     books = MemoryRepo(changed({"base": "two domains"}))
     link = {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}

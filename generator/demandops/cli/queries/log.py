@@ -20,12 +20,12 @@ from demandops.repo import reader
 from demandops.repo.history import revisions
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.reader import Reader
-from demandops.views.vocabulary import Json, commit_data, time_text
+from demandops.views.vocabulary import Json, commit_data, decision_text, time_text
 
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
     *("join", "shutdown", "put", "release", "renew", "expire", "wait", "decommission", "drain"),
-    *("follow", "expire-override", "rollback", "upgrade", "init", "by-hand"),
+    *("follow", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
 )
 
 _TRAILERS = {
@@ -165,13 +165,18 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
 _COLUMNS = (
     column("Commit", lambda row, now: row["commit"][:10]),
     column("When", lambda row, now: relative(parse_time(row["time"]), now), 2),
-    column("What", "summary"),
+    column(
+        "What",
+        lambda row, now: "; ".join(
+            [row["summary"], *([decision_text(row["decision"])] if row["decision"] else [])]
+        ),
+    ),
     column(
         "Requesters",
         lambda row, now: (
             # the trailers name the requesters whose claims changed; a person asked for it
             f"{row['author']}, for {', '.join(row['requesters'])}"
-            if row["operation"] == "rollback"
+            if row["operation"] in ("rollback", "reject")
             else ", ".join(row["requesters"]) or row["author"]
         ),
         1,

@@ -31,9 +31,15 @@ from demandops.repo.load import ledger_files
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.views import release_causes, vocabulary
-from demandops.views.demand_lists import nodes_of
-from demandops.views.kinds import effect_texts
-from demandops.views.vocabulary import Json, commit_data, override_data, release_data, time_text
+from demandops.views.kinds import effect_texts, nodes_of
+from demandops.views.vocabulary import (
+    Json,
+    commit_data,
+    decision_text,
+    override_data,
+    release_data,
+    time_text,
+)
 
 # ---- the object that has the given name ----
 
@@ -302,6 +308,8 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
     yield f"  {entry['commit'][:10]} {when}  {word}, {entry['author']}: {entry['summary']}"
     if why and entry["why"]:
         yield f"    {entry['why']}"
+    if entry["decision"]:
+        yield f"    {decision_text(entry['decision'])}"
     for each in entry["carries_out"]:
         yield f"    carries out commit {each['commit'][:10]} of {each['author']}: {each['summary']}"
 
