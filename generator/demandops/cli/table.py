@@ -67,7 +67,8 @@ class Table:
             )
             for head, wanted, column in zip(heads, natural, texts, strict=True)
         ]
-        used = [at for at in range(len(heads)) if any(row[at] for row in rows)]
+        # a program that reads a whole table finds a column at the same place in each
+        used = [at for at in range(len(heads)) if self.whole or any(row[at] for row in rows)]
         shown, widths = used, natural
         if not self.whole:
             shown, room = [], width + len(_GAP)
@@ -138,6 +139,8 @@ def _laid_out(
 
 # ---- the tables of lists ----
 
+# How many texts of a cell are shown.
+_MOST = 3
 _COLORS = {"bad": "red", "busy": "yellow", "good": "green", "none": ""}
 STYLES = {word: _COLORS[tone] for word, tone in TONES.items()}
 
@@ -146,6 +149,16 @@ def list_table(kind: Kind, rows: Sequence[Row], now: datetime, *, wide: bool = F
     columns = [column for column in kind.columns if wide or not column.only_wide]
     heads = [Column(column.title, column.rank) for column in columns]
     cells = [[column.texts(row.item, now) for column in columns] for row in rows]
+    if not wide:  # of long lists the beginning, so that most rows have one line
+        cells = [
+            [
+                texts
+                if len(texts) <= _MOST
+                else [*texts[: _MOST - 1], f"+{len(texts) - _MOST + 1}"]
+                for texts in row
+            ]
+            for row in cells
+        ]
     for at, column in enumerate(kind.columns if wide else ()):
         if column.form == "time":  # and when that was by the clock
             heads.append(Column(f"{column.title} (UTC)"))

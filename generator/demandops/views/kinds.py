@@ -163,6 +163,9 @@ def _holds(item: Json, now: datetime) -> list[str]:
     return [*item["applications"], *item["connections"]]
 
 
+HOLDS = Column("applications", "Holds", 3, texts_of=_holds, links="held")
+
+
 def _health(source: Source, releases: Iterable[str]) -> str | None:
     # null if no cluster was asked
     return worst_word(map(source.status, releases)) if source.statuses else None
@@ -619,8 +622,7 @@ KINDS: dict[str, Kind] = {
                 HEALTH,
                 ENDED,
                 REQUESTERS,
-                Column("applications", "Applications", 3, links="application"),
-                Column("connections", "Connections", 4, links="connection"),
+                HOLDS,
                 LEASE,
                 SINCE,
                 _names("requests", "Requests", 9, wide=True),
@@ -658,10 +660,10 @@ KINDS: dict[str, Kind] = {
             (
                 _RELEASE,
                 HEALTH,
+                Column("reason", "Reason", 1, texts_of=_reason),
                 _NODE,
-                REQUESTERS,
+                Column("requesters", "Requesters", 4, links="requester"),
                 _FOR,
-                Column("reason", "Reason", 4, texts_of=_reason),
                 Column("since", "Since", 6, "time"),
                 _VERSION,
                 _CLUSTER,
@@ -757,7 +759,7 @@ KINDS: dict[str, Kind] = {
                     3,
                     texts_of=lambda item, now: duration_text(item["lease"]["seconds"]),
                 ),
-                Column("applications", "Holds", 4, texts_of=_holds),
+                HOLDS,
             ),
             _leases,
             _demand,
@@ -800,8 +802,7 @@ KINDS: dict[str, Kind] = {
                 HEALTH,
                 ENDED,
                 Column("demands", "Demands", 3, links="demand"),
-                Column("applications", "Applications", 4, links="application"),
-                Column("connections", "Connections", 5, links="connection"),
+                HOLDS,
                 LEASE,
                 SINCE,
                 _names("nodes", "Nodes", 9, "node", wide=True),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -49,6 +50,8 @@ def part(kind: str, name: str) -> Part:
     if kind in VIEWS_OF:
         view, parameter = VIEWS_OF[kind]
         return Part(name, view, {parameter: name})
+    if kind == "held":  # an application or a connection
+        return Part(name, "releases", {"q": shlex.quote(name)})
     if kind in _LISTS_OF:
         return Part(name, _LISTS_OF[kind], {"q": exactly(kind, name)})
     return Part(name)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import click
 
-from demandops.cli.json_output import output_option, show
+from demandops.cli.json_output import output_formats, show
 from demandops.cli.output import at_option
 from demandops.cli.queries.diff import loaded
 from demandops.cli.table import Table, column, list_table, table_of
@@ -22,7 +22,7 @@ from demandops.views.vocabulary import time_text
 @click.command()
 @state_repo_option
 @at_option
-@output_option
+@output_formats("text", "wide", "json")
 def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     """Show who requests which service and connection.
 
@@ -42,7 +42,7 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     text: list[str | Table] = []
     for name in ("services", "connections"):
         table = list_table(KINDS[name], rows_of(source, name), source.now, wide=True)
-        text += [replace(table, title=name.title(), empty="(nothing)", whole=False), ""]
+        text += [replace(table, title=name.title(), empty="(nothing)", whole=output == "wide"), ""]
     for title, columns, items in (
         ("Suspended", _SUSPENDED, data.get("suspended")),
         ("Capacity", _CAPACITY, capacity),
@@ -55,9 +55,9 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
 
 _SUSPENDED = (
     column("Subject", lambda claim: "{kind} {id}".format(**claim)),
-    column("Demand", "demand", 3),
-    column("Requesters", "requesters", 2),
-    column("By", "override", 1),
+    column("Demand", "demand", 2),
+    column("Requesters", "requesters", 1),
+    column("By", "override", 3),
     column("Reason", "reason", 4),
 )
 _CAPACITY = (

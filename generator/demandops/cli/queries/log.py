@@ -167,9 +167,10 @@ _COLUMNS = (
     column("When", lambda row, now: relative(parse_time(row["time"]), now), 2),
     column(
         "What",
-        lambda row, now: "; ".join(
-            [row["summary"], *([decision_text(row["decision"])] if row["decision"] else [])]
-        ),
+        lambda row, now: [
+            row["summary"],
+            *([decision_text(row["decision"])] if row["decision"] else []),
+        ],
     ),
     column(
         "Requesters",

@@ -132,8 +132,7 @@ def status(
     unwatched = ", ".join(f"'{name}'" for name in source.unwatched)
     if unwatched and output == "text":
         errors.print(
-            f"the state of cluster {unwatched} is unknown: --clusters FILE gives access "
-            "(docs/status.md)"
+            f"the state of cluster {unwatched} is unknown: give --clusters FILE (docs/status.md)"
         )
     if wrong := amiss(source, clusters):
         errors.print(f"not well: {wrong}")
@@ -167,6 +166,8 @@ def ask_clusters(
         for name, cluster in clusters.items()
         if cluster.kubeconfig and name in source.watched_objects
     }
+    if not caches:
+        return source
     # all clusters are read at the same time, so that a slow cluster does not delay the others
     threads = {
         name: REAL.start_thread(
