@@ -43,7 +43,7 @@ COMMANDS = {
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
     "log": ("queries.log", "List the commits of the state repo, newest first."),
-    "new": ("authoring.new", "Write a new application, override or image."),
+    "new": ("authoring.new", "Write a new application or image."),
     "override": ("changes.override", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
         "demandops_ros.parameter_sync",

@@ -461,6 +461,8 @@ class Worker:
             if getattr(error, "errno", None) is None:
                 told = access_error(error, self._repository.address, self._repository.objects)
                 if isinstance(told, StateRepoError):
+                    if self._repository.renew_if_damaged():
+                        raise Unavailable(f"{told}; the clone is made anew") from None
                     return told
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return internal(error)

@@ -7,6 +7,7 @@ import shlex
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from datetime import timezone
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -35,10 +36,11 @@ from demandops.serve.http_server import HttpServer
 from demandops.views.kinds import KINDS, rows_of
 from demandops.views.rows import Filter, exactly, page_of, sorted_rows
 from demandops.views.source import WORDS, Source
-from demandops.web import fleet_map, not_ready, time_line
+from demandops.web import fleet_map, not_ready, overview, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, PAGE, Part, cells_of
 from demandops.web.release_view import explained_demand, explained_release
+from demandops.web.time_line import Event
 
 # ---- the views, by address ----
 
@@ -46,15 +48,15 @@ from demandops.web.release_view import explained_demand, explained_release
 _KEPT = ("at", "q")
 
 NAVIGATION = (
-    ("", "Not ready"),
+    ("", "Overview"),
     ("map", "Map"),
     *((name, KINDS[name].title) for name in LISTS),
     ("timeline", "Time line"),
-    ("rates", "Rates"),
 )
 
 
 _MOST_CAUSES = 100
+_NEWEST = 8  # changes
 
 Data = dict[str, Any]
 View = Callable[["ViewRequest"], tuple[str, Data]]
@@ -85,19 +87,28 @@ class ViewRequest:
         query = f"?{urlencode(params)}" if params else ""
         return f"/{self.path if path is None else path}{query}"
 
+    def events(self) -> list[Event]:
+        every = time_line.events(self.follower.history, self.follower.health_changes)
+        return [event for event in every if not self.filter or self.filter.matches(event.row())]
+
     def link(self, part: Part) -> str:
         # with its own filter instead of the current one
         return self.to(part.view, **{"q": "", **part.params})
 
 
-def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
-    causes = not_ready.causes(asked.source, asked.filter)
-    applications = not_ready.applications(asked.source, causes, asked.filter)
-    return "not_ready.html.j2", {
+def _overview(asked: ViewRequest) -> tuple[str, Data]:
+    source = asked.source
+    causes = not_ready.causes(source, asked.filter)
+    moment = source.now if source.is_newest else source.entry.time
+    events = [event for event in asked.events() if event.time <= moment]
+    return "overview.html.j2", {
+        "figures": overview.figures(source, asked.filter, events, moment),
         "causes": causes[:_MOST_CAUSES],
         "total": len(causes),
-        "applications": applications,
+        "applications": not_ready.applications(source, causes, asked.filter),
         "tones": {**WORDS, **not_ready.KINDS},
+        "events": islice(overview.newest(events), _NEWEST),
+        "overrides": source.overrides,
     }
 
 
@@ -127,18 +138,16 @@ def _list(asked: ViewRequest) -> tuple[str, Data]:
 def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     now, lane = asked.source, asked.get("lane")
     lanes = {lane} if lane in time_line.LANES else time_line.LANES
-    events = [
-        event
-        for event in time_line.events(asked.follower.history, asked.follower.health_changes)
-        if event.lane in lanes and (not asked.filter or asked.filter.matches(event.row()))
-    ]
+    events = [event for event in asked.events() if event.lane in lanes]
+    span, events = time_line.within(events, asked.get("span"), now.now)
     chosen = None if now.is_newest else (now.entry.time, now.commit)
     changed: list[str] = []
     if asked.get("at"):
         changed = asked.follower.reader().files_changed_by(now.commit)
     shown, page, pages = page_of(events, asked.page(), size=50)
     return "timeline.html.j2", {
-        "strip": time_line.strip(events, now.now, asked.get("span"), chosen),
+        "strip": time_line.strip(events, now.now, span, chosen),
+        "span": span,
         "lanes": time_line.LANES,
         "lane": lane,
         "spans": time_line.SPANS,
@@ -151,21 +160,10 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     }
 
 
-def _rates(asked: ViewRequest) -> tuple[str, Data]:
-    span = asked.get("span") if asked.get("span") in time_line.SPANS else "1d"
-    health = asked.follower.health_changes
-    commits = [
-        commit
-        for commit in asked.follower.history
-        if asked.filter.matches(time_line.of_commit(commit).row())
-    ]
-    plots = time_line.plots(commits, health, asked.source.now, span)
-    size = {"width": time_line.WIDTH, "height": time_line.HEIGHT}
-    return "rates.html.j2", {"plots": plots, "span": span, "spans": time_line.SPANS, **size}
 
 
 VIEWS: Mapping[str, View] = {
-    "/": _not_ready,
+    "/": _overview,
     "/map": lambda asked: (
         "map.html.j2",
         {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
@@ -180,7 +178,6 @@ VIEWS: Mapping[str, View] = {
         {"release": explained_release(asked.source, asked.follower.reader(), asked.get("name"))},
     ),
     "/timeline": _timeline,
-    "/rates": _rates,
 }
 
 

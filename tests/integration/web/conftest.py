@@ -24,7 +24,7 @@ from tests.kit import goals
 from tests.kit.generator import book, running, wait_until
 from tests.kit.html import Page
 
-VIEWS = ("/", "/map", "/services", "/timeline", "/rates", *(f"/{name}" for name in LISTS))
+VIEWS = ("/", "/map", "/services", "/timeline", *(f"/{name}" for name in LISTS))
 DENY = """apiVersion: demandops/v1
 kind: Override
 reason: The road is closed

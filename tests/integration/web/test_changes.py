@@ -217,17 +217,17 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
     drawn = fleet_map.picture(follower.newest, Filter(""), "")
     assert (drawn["layout"], drawn["layouts"]) == ("place", ("cluster", "place"))
     for layout in drawn["layouts"]:
-        cards = fleet_map.picture(follower.newest, Filter(""), layout)["nodes"]
-        for one in cards:
-            assert one.x >= 0 and one.x + one.width <= fleet_map.WIDTH
-            assert not [o for o in cards if o is not one and _cover(one, o)]
-    by_id = {card.id: card for card in drawn["nodes"]}
+        for drawing in fleet_map.picture(follower.newest, Filter(""), layout)["drawings"]:
+            for card in drawing.cards:
+                assert card.x >= 0 and card.x + card.width <= drawing.width
+                assert not [o for o in drawing.cards if o is not card and _cover(card, o)]
+    by_id = {card.label: card for card in drawn["drawings"][0].cards}
     ids = [node["id"] for node in nodes["nodes"]]
     assert by_id[ids[0]].x < by_id[ids[1]].x < by_id[ids[2]].x
     assert by_id[ids[-1]].y < by_id[ids[0]].y
 
 
-def _cover(one: fleet_map.NodeCard, other: fleet_map.NodeCard) -> bool:
+def _cover(one: fleet_map.Card, other: fleet_map.Card) -> bool:
     beside = one.x + one.width <= other.x or other.x + other.width <= one.x
     return not (beside or one.y + one.height <= other.y or other.y + other.height <= one.y)
 

@@ -195,27 +195,74 @@ def test_the_page_shows_the_claims_at_an_earlier_commit(look: Look, state: GitRe
 def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:
     now = follower.newest
     demand = next(one.demand for one in now.state.ledger if "vehicle01" in one.requesters)
-    lit = fleet_map.picture(now, Filter(f"demand={demand}"), "")
-    assert {node.id for node in lit["nodes"] if node.is_lit} == {"edge", "station00", "vehicle01"}
-    services = {one.name for node in lit["nodes"] for one in node.services if one.is_lit}
-    assert DETECTION not in services and "od-edge-station00" in services
+    wide, _ = fleet_map.picture(now, Filter(f"demand={demand}"), "")["drawings"]
+    lit = [card for card in wide.cards if card.is_lit]
+    assert {card.label for card in lit} == {"edge", "station00", "vehicle01"}
+    on_edge = {mark.text: mark.is_lit for card in lit for mark in card.marks}
+    assert on_edge["object-detection · station00"] and on_edge["mqtt vehicle01/edge"]
+    assert not on_edge["object-detection · vehicle00"]
 
 
-def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: Follower) -> None:
+def fleet_of(follower: Follower, vehicles: int, edges: int = 1) -> Source:
+    """Return the newest source with more nodes, which demand nothing."""
     config = follower.newest.config
-    model, far = next(iter(config.nodes.values())), [f"far{number}" for number in range(1000)]
-    nodes = {**config.nodes, **{id: model.model_copy(update={"id": id}) for id in far}}
-    now = changed(follower, config=replace(config, nodes=nodes))
-    state = now.state
-    drawn = fleet_map.picture(now, Filter(""), "")
-    assert (drawn["nodes"], drawn["total"]) == ([], len(state.config.nodes))
-    squares = sum(path.count("M") for _, path in drawn["many_nodes"])
-    assert squares == len(state.config.nodes)
-    few = fleet_map.picture(now, Filter("node=far7"), "")
-    assert [node.id for node in few["nodes"]] == ["far7"] and few["only_lit"]
-    # the filter finds too many nodes to draw them alone, so the whole fleet is drawn
-    many = fleet_map.picture(now, Filter("node:far"), "")
-    assert many["is_dimmed"] and {node.id for node in many["nodes"]} == set(far)
+    model, more = config.nodes["vehicle00"], dict(config.nodes)
+    for type, count in (("edge", edges), ("vehicle", vehicles)):
+        for number in range(count):
+            id = f"far-{type}{number}"
+            more[id] = model.model_copy(update={"id": id, "type": type})
+    return changed(follower, config=replace(config, nodes=more))
+
+
+def test_many_nodes_are_drawn_as_stacks_that_a_filter_opens(follower: Follower) -> None:
+    source = fleet_of(follower, 1000)
+    for drawing in fleet_map.picture(source, Filter(""), "")["drawings"]:
+        assert sum(len(card.nodes) for card in drawing.cards) == len(source.config.nodes)
+        (stack,) = [card for card in drawing.cards if len(card.nodes) >= 1000]
+        assert stack.label.endswith(" vehicles")
+    # a stack's own filter chooses its nodes, and a filter that finds few draws each of them
+    for query, count in ((stack.query, len(stack.nodes)), ("node=far-vehicle7", 1)):
+        found = fleet_map.picture(source, Filter(query), "")
+        assert found["lit"] == count
+    (lit,) = [card for card in found["drawings"][0].cards if card.is_lit]
+    assert lit.label == "far-vehicle7" and len(found["drawings"][0].cards) < 20
+
+
+@pytest.mark.parametrize("query", ["", "edge", "vehicle01"])
+@pytest.mark.parametrize(("vehicles", "edges"), [(0, 0), (25, 20), (200, 20)])
+def test_no_line_runs_behind_a_card(
+    follower: Follower, vehicles: int, edges: int, query: str
+) -> None:
+    source = fleet_of(follower, vehicles, edges)
+    for drawing in fleet_map.picture(source, Filter(query), "cluster")["drawings"]:
+        assert drawing.lines
+        for line in drawing.lines:
+            for x, y in points(line.path):
+                assert 0 <= x <= drawing.width and 0 <= y <= drawing.height
+                assert not [
+                    card.label
+                    for card in drawing.cards
+                    if card.x < x < card.x + card.width and card.y < y < card.y + card.height
+                ]
+
+
+def points(path: str) -> list[tuple[float, float]]:
+    """Return points on a path of the commands M, V and C, close to each other."""
+    here, found = (0.0, 0.0), list[tuple[float, float]]()
+    for command, text in re.findall(r"([MVC])([^MVC]*)", path):
+        numbers = [float(number) for number in text.split()]
+        if command == "V":
+            numbers = [here[0], here[1], here[0], numbers[0], here[0], numbers[0]]
+        ends = list(zip(numbers[::2], numbers[1::2], strict=True))
+        if command != "M":
+            for step in range(33):
+                t = step / 32
+                weights = ((1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3)
+                at = zip(*(here, *ends), strict=True)
+                x, y = (sum(w * v for w, v in zip(weights, values, strict=True)) for values in at)
+                found.append((x, y))
+        here = ends[-1]
+    return found
 
 
 def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:

@@ -19,13 +19,12 @@ from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.base.strict_yaml import read_input
 from demandops.cli import json_output, target
-from demandops.cli.authoring.scaffold import document
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import writable
 from demandops.cli.output import done, errors, progress
 from demandops.cli.target import names_of
 from demandops.decide.override_report import override_report
-from demandops.model.config.base_model import parse_file, parse_time, seconds_of
+from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.ledger.ledger import World

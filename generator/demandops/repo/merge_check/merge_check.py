@@ -145,6 +145,7 @@ def check(
                 *(fault("", text).within(path) for path, text in idle),
                 *warnings.ignored_field_warnings(state.config),
                 *warnings.truth_warnings(files),
+                *warnings.request_warnings(state.config),
                 *warnings.policy_warnings(state),
                 *warnings.unmatched_pattern_warnings(state.config),
                 *warnings.tied_override_warnings(new.values()),
