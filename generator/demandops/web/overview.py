@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import groupby
 
-from demandops.views.source import RANKS, Source
 from demandops.views.kinds import rows_of
 from demandops.views.rows import TONES, Filter, Row, exactly
+from demandops.views.source import RANKS, Source
 from demandops.web.lists import Part
 from demandops.web.time_line import BOOKED, RELEASED, Event
 
@@ -36,7 +36,7 @@ def figures(source: Source, wanted: Filter, events: Iterable[Event], now: dateti
             (Part(f"{count} {word}", view, {"q": exactly("health", word)}), TONES[word])
             for word, count in sorted(counts.items(), key=lambda pair: RANKS[pair[0]])
         ]
-        return Figure(len(rows), Part(what, view), words)
+        return Figure(len(rows), Part(_counted(len(rows), what), view), words)
 
     services, connections, demands = map(matching, ("services", "connections", "demands"))
     requesters = {who for row in demands for who in row.item["requesters"]}
@@ -58,20 +58,31 @@ def figures(source: Source, wanted: Filter, events: Iterable[Event], now: dateti
         return Part(f"{booked} booked, {released} released in the last {span}"), ""
 
     return [
-        of_list(services, "services", "services"),
-        of_list(connections, "connections", "connections"),
-        of_list(demands, "demands", "demands"),
-        Figure(len(requesters), Part("requesters", "requesters")),
+        of_list(services, "service", "services"),
+        of_list(connections, "connection", "connections"),
+        of_list(demands, "demand", "demands"),
+        Figure(
+            len(requesters),
+            Part(_counted(len(requesters), "requester"), "requesters"),
+        ),
         Figure(len(nodes), Part(f"of {len(source.config.nodes)} nodes used", "map")),
         Figure(
-            sum(count for count, _ in waits), Part("wait", "proposals"), [part for _, part in waits]
+            sum(count for count, _ in waits),
+            Part("waiting", "proposals"),
+            [part for _, part in waits],
         ),
         Figure(
             len(last_hour),
-            Part("changes in the last hour", "timeline", {"span": "1h"}),
+            Part(
+                f"{_counted(len(last_hour), 'change')} in the last hour", "timeline", {"span": "1h"}
+            ),
             [rate(last_hour, "hour"), rate(last_day, "day")],
         ),
     ]
+
+
+def _counted(count: int, word: str) -> str:
+    return word if count == 1 else f"{word}s"
 
 
 def newest(events: Sequence[Event]) -> Iterator[tuple[Event, int]]:

@@ -160,8 +160,6 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     }
 
 
-
-
 VIEWS: Mapping[str, View] = {
     "/": _overview,
     "/map": lambda asked: (

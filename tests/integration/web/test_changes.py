@@ -27,6 +27,7 @@ from tests.integration.web.conftest import DENY, VIEWS, Look, causes
 from tests.kit import goals
 from tests.kit.config import override
 from tests.kit.generator import Proposed, book, running, wait_until
+from tests.kit.html import Page
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, Person, away, git
 
@@ -200,6 +201,48 @@ def test_the_time_line_has_lanes_for_demands_overrides_and_people(
     assert "A person's change" in look("/timeline", lane="overrides").text
     assert "Greet" in look("/timeline", lane="people").text
     assert len(look("/timeline", q="who:vehicle01").texts("tr")[1:]) == 1
+
+
+def test_a_span_of_the_time_line_lists_only_its_events(booked: Generator, look: Look) -> None:
+    def commits(page: Page) -> list[str]:
+        return [text.split()[-1] for text in page.texts("tr")[1:]]
+
+    everything = look("/timeline", span="all")
+    assert len(commits(everything)) == 3 and "Create the state repo" in everything.text  # long ago
+    page = look("/timeline", span="15min")
+    assert commits(page) == commits(everything)[:2]
+    assert "2 events in the last 15min" in page.text
+    dots = [title for title in page.texts("title") if " UTC, " in title]
+    more = [int(count) for title in dots for count in re.findall(r"and (\d+) more", title)]
+    assert len(dots) + sum(more) == 2  # the drawing has the same events as the list
+    assert len(commits(look("/timeline", span="7d", q="who:vehicle01"))) == 1
+
+
+def test_the_overview_has_the_fleet_in_figures(
+    booked: Generator, person: Person, look: Look
+) -> None:
+    def figures(**asked: str) -> list[str]:
+        return look("/", **asked).texts("li")[:7]
+
+    assert figures() == [
+        "3 services 3 unknown",
+        "3 connections 3 unknown",
+        "2 demands 2 unknown",
+        "3 requesters",
+        "4 of 7 nodes used",
+        "0 waiting",
+        "2 changes in the last hour 2 booked, 0 released in the last hour "
+        "2 booked, 0 released in the last day",
+    ]
+    book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
+    person.override(roadworks=DENY)
+    overridden(booked)
+    told = figures(q="vehicle01")
+    assert told[1:4] == ["1 connection 1 unknown", "1 demand 1 unknown", "2 requesters"]
+    assert "1 booked, 0 released in the last day" in told[-1]
+    assert "1 booked, 1 released" not in told[-1] and "1 released in the last day" in figures()[-1]
+    page = look("/")
+    assert "1 override: 1 in force" in page.text
 
 
 def test_nodes_are_drawn_where_they_are_and_cover_no_other(
