@@ -20,6 +20,8 @@ from demandops.views.vocabulary import Json
 
 Command = Callable[..., Any]
 
+# The width of tables elsewhere than on a terminal.
+_NARROW = 80
 _PATH = "jsonpath="
 _STEP = re.compile(r"\.?\*|\.?([\w-]+)|\[(\*|-?\d+)\]|\[(['\"])(.*?)\3\]")
 
@@ -73,7 +75,7 @@ def show(output: str, data: object, text: Iterable[str | Table]) -> None:
     printed: list[str] = []
     for part in text:
         if isinstance(part, Table):
-            printed += part.lines(terminal_width(), painted)
+            printed += part.lines(terminal_width() or _NARROW, painted)
         else:
             printed += lines(part).split("\n")
     print_lines(printed)

@@ -91,8 +91,8 @@ def open_streams() -> None:
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
 
 
-def terminal_width() -> int:
-    return shutil.get_terminal_size().columns  # 80 elsewhere than on a terminal
+def terminal_width() -> int | None:
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def painted(text: str, style: str) -> str:
