@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 
 from demandops.model.config.base_model import parse_time
 from demandops.views.kinds import Kind
-from demandops.views.rows import TONES, Column, Row, exactly
+from demandops.views.rows import TONES, Column, Row
 
 # The lists of the page, in the order of its navigation.
 LISTS = (
@@ -26,17 +25,6 @@ LISTS = (
 # How many rows a page of a list has at most.
 PAGE = 100
 
-# The view of one thing, and its parameter, by the kind of thing.
-VIEWS_OF = {"release": ("release", "name"), "demand": ("demand", "id")}
-# The list that shows what has to do with one thing of any other kind.
-_LISTS_OF = {
-    "node": "releases",
-    "requester": "demands",
-    "application": "releases",
-    "connection": "connections",
-    "override": "overrides",
-}
-
 
 @dataclass(frozen=True, slots=True)
 class Part:
@@ -46,15 +34,10 @@ class Part:
 
 
 def part(kind: str, name: str) -> Part:
-    """Return the name of a thing with a link to what shows it; ``kind`` may be empty."""
-    if kind in VIEWS_OF:
-        view, parameter = VIEWS_OF[kind]
-        return Part(name, view, {parameter: name})
-    if kind == "held":  # an application or a connection
-        return Part(name, "releases", {"q": shlex.quote(name)})
-    if kind in _LISTS_OF:
-        return Part(name, _LISTS_OF[kind], {"q": exactly(kind, name)})
-    return Part(name)
+    """Return the name of a thing with a link to its view; none if ``kind`` is empty."""
+    # what is held is an application or a connection
+    params = {"name": name} if kind == "held" else {"kind": kind, "name": name}
+    return Part(name, "thing", params) if kind else Part(name)
 
 
 @dataclass(frozen=True, slots=True)

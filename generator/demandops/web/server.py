@@ -30,16 +30,18 @@ from demandops import __version__
 from demandops.base import settings
 from demandops.base.errors import DemandOpsError, InvalidInput
 from demandops.base.quoting import escaped, lines
-from demandops.model.config.base_model import relative
+from demandops.model.config.base_model import parse_time, relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
+from demandops.views import causes as cause_list
 from demandops.views.kinds import KINDS, rows_of
-from demandops.views.rows import Filter, exactly, page_of, sorted_rows
+from demandops.views.rows import Filter, Row, exactly, page_of, sorted_rows
 from demandops.views.source import WORDS, Source
-from demandops.web import fleet_map, not_ready, overview, time_line
+from demandops.views.vocabulary import decision_text
+from demandops.web import fleet_map, overview, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, PAGE, Part, cells_of
-from demandops.web.release_view import explained_demand, explained_release
+from demandops.web.thing import thing
 from demandops.web.time_line import Event
 
 # ---- the views, by address ----
@@ -97,16 +99,16 @@ class ViewRequest:
 
 
 def _overview(asked: ViewRequest) -> tuple[str, Data]:
-    source = asked.source
-    causes = not_ready.causes(source, asked.filter)
+    source, wanted = asked.source, asked.filter
+    causes = [cause for cause in cause_list.causes(source) if wanted.matches(Row(cause.labels))]
     moment = source.now if source.is_newest else source.entry.time
     events = [event for event in asked.events() if event.time <= moment]
     return "overview.html.j2", {
-        "figures": overview.figures(source, asked.filter, events, moment),
-        "causes": causes[:_MOST_CAUSES],
+        "figures": overview.figures(source, wanted, events, moment),
+        "causes": [(cause, overview.link_of(cause)) for cause in causes[:_MOST_CAUSES]],
         "total": len(causes),
-        "applications": not_ready.applications(source, causes, asked.filter),
-        "tones": {**WORDS, **not_ready.KINDS},
+        "applications": overview.applications(source, causes, wanted),
+        "tones": {**WORDS, **cause_list.KINDS},
         "events": islice(overview.newest(events), _NEWEST),
         "overrides": source.overrides,
     }
@@ -160,6 +162,14 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     }
 
 
+def _thing(asked: ViewRequest) -> tuple[str, Data]:
+    # `/demand?id=` and `/release?name=` are in people's bookmarks
+    kind = asked.get("kind") if asked.path == "thing" else asked.path
+    name = asked.get("id") or asked.get("name")
+    health = asked.follower.health_changes if asked.source.is_newest else ()
+    return "thing.html.j2", thing(asked.source, name, kind, health)
+
+
 VIEWS: Mapping[str, View] = {
     "/": _overview,
     "/map": lambda asked: (
@@ -167,14 +177,9 @@ VIEWS: Mapping[str, View] = {
         {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
     ),
     **{f"/{name}": _list for name in (*LISTS, "services")},
-    "/demand": lambda asked: (
-        "demand.html.j2",
-        {"demand": explained_demand(asked.source, asked.follower.reader(), asked.get("id"))},
-    ),
-    "/release": lambda asked: (
-        "release.html.j2",
-        {"release": explained_release(asked.source, asked.follower.reader(), asked.get("name"))},
-    ),
+    "/thing": _thing,
+    "/demand": _thing,
+    "/release": _thing,
     "/timeline": _timeline,
 }
 
@@ -248,6 +253,8 @@ class Site:
             ),
             "ago": relative,
             "iso": lambda at: f"{at.astimezone(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
+            "moment": parse_time,
+            "decision": decision_text,
             "sh": shlex.quote,
         }
         self.application = Starlette(
