@@ -11,14 +11,7 @@ import click
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import (
-    Json,
-    commit_data,
-    decision_text,
-    output_formats,
-    show,
-    time_text,
-)
+from demandops.cli.json_output import output_formats, show
 from demandops.cli.output import busy
 from demandops.cli.queries.diff import resolved
 from demandops.cli.table import Table, column, table_of
@@ -28,6 +21,7 @@ from demandops.repo import reader
 from demandops.repo.history import revisions
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.reader import Reader
+from demandops.views.vocabulary import Json, commit_data, decision_text, time_text
 
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
@@ -180,7 +174,6 @@ _COLUMNS = (
             row["summary"],
             *([decision_text(row["decision"])] if row["decision"] else []),
         ],
-        wraps=True,
     ),
     column(
         "Requesters",
@@ -191,7 +184,6 @@ _COLUMNS = (
             else ", ".join(row["requesters"]) or row["author"]
         ),
         1,
-        wraps=True,
     ),
 )
 _WIDE = (
