@@ -459,7 +459,7 @@ def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | Non
         by_name = {release.name: release for release in releases}
         data["releases"] = [
             release_data(release)
-            | {"health": word_of(source.status(name)) if source.statuses else None}
+            | ({"health": word_of(source.status(name))} if source.statuses else {})
             for name, release in sorted(by_name.items())
         ]
     return data

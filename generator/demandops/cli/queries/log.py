@@ -13,6 +13,7 @@ from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli.json_output import output_formats, show
 from demandops.cli.output import busy
+from demandops.cli.queries.diff import resolved
 from demandops.cli.table import Table, column, table_of
 from demandops.cli.target import name_options, state_repo_option
 from demandops.model.config.base_model import parse_time, relative
@@ -106,6 +107,8 @@ def log(
       demandops log main~20..main -o wide
     """
     with reader.opened(state_repo) as repo:
+        for side in filter(None, (commit_range or "").split("..")):
+            resolved(repo, side)
         release, path = given.pop("release"), None
         if release is not None:
             tip = repo.commit((commit_range or "").rpartition("..")[2])
