@@ -157,17 +157,6 @@ _REMEDIES = (
 _NO_FILE = re.compile(r"unable to access '[^':]*':.*")
 
 
-# ---- who is told that git takes long with a remote ----
-
-_listeners: list[Callable[[str], None]] = []
-
-
-def listen(listener: Callable[[str], None]) -> None:
-    # It replaces the earlier one. A slow run of git calls it each second with a text about what git
-    # does, and with an empty text when git has ended.
-    _listeners[:] = [listener]
-
-
 # ---- the clone ----
 
 _REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
@@ -413,7 +402,7 @@ class RemoteRepository(StateRepository):
                 took = REAL.monotonic() - start
                 if int(took) > told:
                     told, doing = int(took), _DOING.get(command[0], "asking")
-                    for listener in _listeners:
+                    for listener in child_processes.listeners:
                         listener(f"{doing} {self.address}, {told} s")
                 self.while_waiting()
                 if urgent():
@@ -425,7 +414,7 @@ class RemoteRepository(StateRepository):
             if process.returncode is None:
                 _terminate(process)
             self._process = None
-            for listener in _listeners if told else ():
+            for listener in child_processes.listeners if told else ():
                 listener("")
         texts = [text.decode("utf-8", "replace") for text in (out, err)]
         code, took = process.returncode, REAL.monotonic() - start
