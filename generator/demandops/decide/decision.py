@@ -37,7 +37,7 @@ from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand
-from demandops.model.demand.goals import goal_field, read_goal
+from demandops.model.demand.goals import goal_field, read_goal, size_faults
 from demandops.model.ledger.claim import demand_id
 from demandops.model.ledger.ledger import Changes, World, claim_changes, ledger_of
 from demandops.model.ledger.records import Wait, WaitingDemand
@@ -212,7 +212,7 @@ def _searched(
     """Return what the attempt returns for the completed demand on the first nodes that do."""
     if demand.is_complete:
         return attempt(demand, ())
-    if faults := list(admission.size_faults(demand, state.config.repo_settings.limits)):
+    if faults := list(size_faults(demand, state.config.repo_settings.limits)):
         raise Refused(faults)
     checkpoint()
     request, unclear = prepared(demand, state)
@@ -242,7 +242,7 @@ def admitted(
         return request
     request, config = completed(request, state, checkpoint), state.config
     # derived connections count as well
-    if large := list(admission.size_faults(request, config.repo_settings.limits)):
+    if large := list(size_faults(request, config.repo_settings.limits)):
         raise Refused(large)
     checkpoint()
     found = [*faults, *_paced(admission.faults(request, config), checkpoint)]

@@ -6,7 +6,6 @@ check what the policy allows (:mod:`.permission`).
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain
@@ -26,7 +25,6 @@ from demandops.model.config.config import (
     VERSIONS_FILE,
     Config,
 )
-from demandops.model.config.repo_settings import Limits
 from demandops.model.demand.demand import (
     LONGEST_S,
     AnyDemand,
@@ -36,7 +34,6 @@ from demandops.model.demand.demand import (
     Demand,
     Item,
 )
-from demandops.model.demand.goals import ITEMS, too_large
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
 
@@ -77,36 +74,6 @@ def faults(request: Demand, config: Config) -> Iterator[Fault]:
         for each in chain(_id_faults("id", held.id), _requester_faults(item.requesters), of_held):
             if not (unplaced and each.field == "node"):
                 yield item.fault(each.field, each.message, code=each.code)
-
-
-def items_of(request: Demand) -> int:
-    items = len(request.own_requesters) + len(request.positions)
-    for item in request.demanded:
-        held = item.held
-        if isinstance(held, Application):
-            topics = sum(map(len, held.inputs.values()))
-            items += len(held.deliver) + len(held.named) + (held.place.size if held.place else 0)
-        else:
-            topics = len(held.topics)
-        items += len(item.requesters) if request.is_reference else 0
-        # each requester holds each topic of its item, so a topic counts once for each of them
-        items += (1 + topics) * max(1, len(item.requesters))
-    return items
-
-
-def size_faults(request: Demand, limits: Limits) -> Iterator[Fault]:
-    for item in request.demanded:
-        held = item.held
-        if isinstance(held, Application) and held.parameters:
-            size = len(json.dumps(dict(held.parameters), default=str))
-            if size > limits.parameter_bytes:
-                message = too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
-                yield item.fault("parameters", message, code="too-large")
-    items = items_of(request)
-    if items > limits.demand_items:
-        listed = f"lists {items} {ITEMS}"
-        message = too_large(listed, "demandItems", limits.demand_items)
-        yield fault("id" if request.is_reference else "demand", message, code="too-large")
 
 
 def _application_faults(app: Application, config: Config, claiming: bool) -> Iterator[Fault]:
