@@ -8,7 +8,7 @@ from contextlib import suppress
 from itertools import chain, islice
 from typing import TypeAlias
 
-from rpds import HashTrieMap, HashTrieSet
+from rpds import HashTrieMap
 
 from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, Refused, fault
@@ -225,11 +225,11 @@ def _field(request: Demand, key: ServiceKey, service: Service) -> str:
 # What is named, in words, and its name.
 Name: TypeAlias = "tuple[str, str]"
 
-# For each name, the keys of the releases that have it: one, if nobody wrote claims by hand. The
-# releases of suspended claims count too, because they will run again. A key that no claim needs any
-# longer may be left; :func:`.release_keys.is_needed` tells. All names of a large
-# ledger take long to find, so they follow each change, in a map that shares what did not change.
-Names: TypeAlias = "HashTrieMap[Name, HashTrieSet[ReleaseKey]]"
+# For each name, the key of the release that has it. The releases of suspended claims count too,
+# because they will run again. A key that no claim needs any longer may be left;
+# :func:`.release_keys.is_needed` tells. All names of a large ledger take long to find, so they
+# follow each change, in a map that shares what did not change.
+Names: TypeAlias = "HashTrieMap[Name, ReleaseKey]"
 
 NONE: Names = HashTrieMap()
 
@@ -252,24 +252,20 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
 
 def all_names(world: World) -> Names:
     keys = (key for claims in world.ledger.claims.values() for key in keys_of_claims(world, claims))
-    return with_keys(NONE, world, dict.fromkeys(keys))
-
-
-def with_keys(names: Names, world: World, keys: Iterable[ReleaseKey]) -> Names:
-    for key in keys:
-        for name in names_of(world, key):
-            names = names.insert(name, (names.get(name) or HashTrieSet()).insert(key))
-    return names
+    return NONE.update({name: key for key in keys for name in names_of(world, key)})
 
 
 def followed(names: Names, before: World, after: World, keys: Collection[ReleaseKey]) -> Names:
     """Return the names in ``after``; only the releases at ``keys`` differ from ``before``."""
     for key in keys:
         for name in names_of(before, key):
-            others = (names.get(name) or HashTrieSet()).discard(key)
-            names = names.insert(name, others) if others else names.discard(name)
-    # A release that an override denies needs its name all the same.
-    return with_keys(names, after, (key for key in keys if is_needed(after, key)))
+            names = names.discard(name) if names.get(name) == key else names
+    for key in keys:
+        # A release that an override denies needs its name all the same.
+        for name in names_of(after, key) if is_needed(after, key) else ():
+            if (other := names.get(name)) is None or not is_needed(after, other):
+                names = names.insert(name, key)
+    return names
 
 
 def name_faults(
@@ -283,12 +279,11 @@ def name_faults(
     """Yield a fault for each new release that needs one of ``names``, those of ``before``."""
     for key in keys:
         for name in names_of(after, key):
-            others = (names.get(name) or HashTrieSet()).discard(key)
-            names = names.insert(name, others.insert(key))  # for the keys that follow
+            other = names.get(name) or key
+            if other == key or not is_needed(after, other):
+                names = names.insert(name, key)  # for the keys that follow
             # a release keeps the name that it has, even if a person gave another one this name
-            if not others or not is_needed(after, key) or is_needed(before, key):
-                continue
-            for other in islice((each for each in others if is_needed(after, each)), 1):
+            elif is_needed(after, key) and not is_needed(before, key):
                 claims = {change.key.subject: change.key for change in changes.claims}
                 needing = (
                     claim
