@@ -106,7 +106,7 @@ E2E := tests/e2e --ignore=tests/e2e/argocd
 E2E_PATH := tests/e2e/flux/test_experiment.py
 # If E2E_KUBECONFIG names a cluster, the tests use that cluster and start no programs of their own.
 e2e: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
-e2e: system-e2e setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests on a real cluster with Flux (docs/e2e.md)
+e2e: system-e2e setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests on a real cluster with Flux (tests/e2e/README.md)
 	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools --for flux; fi
 	@$(PY) -m pytest -p no:cacheprovider $(E2E) -q
 
@@ -120,7 +120,7 @@ e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONF
 
 # With FIGURES=1 the target also draws the plots of the docs: docs/figures
 experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
-experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (docs/experiment.md)
+experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (tests/experiment/README.md)
 	@$(PY) -m tests.experiment $(EXPERIMENT)
 
 check: system-test setup  ## Format, lint, types, imports, docs, test, test-processes and test-packages

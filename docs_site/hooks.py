@@ -17,12 +17,13 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
-from docs_site import commands, errors, interfaces, schemas
+from docs_site import commands, errors, interfaces, schemas, vocabulary
 
 ROOT = Path(__file__).parents[1]
 GENERATED = {
     "generated/commands.md": commands.page,
     "generated/schemas.md": schemas.page,
+    "generated/json.md": vocabulary.page,
     "generated/ros.md": interfaces.page,
     "generated/errors.md": errors.page,
 }
@@ -36,6 +37,8 @@ OF_THE_ROOT = {
     "examples/lane-detection/appdefs/lane-detection/charts/ros-launch/README.md": (
         "project/ros-launch.md"
     ),
+    "tests/experiment/README.md": "project/experiment.md",
+    "tests/e2e/README.md": "project/e2e.md",
     "tests/e2e/PROOF.md": "project/e2e-proof.md",
     "tests/e2e/rig/README.md": "project/e2e-rig.md",
 }

@@ -193,7 +193,7 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
         yield (
             "parameter k3d_image_registry of the reference is not used: set the field 'registry' "
             f"to {registry} in {config.place_of(IMAGES_FILE)}, and give the images the "
-            "names that they have in that registry (docs/migration.md)"
+            "names that they have in that registry (docs/reference.md)"
         )
     for name, host in values.items():
         if (match := _BROKER.fullmatch(name)) is None:

@@ -97,7 +97,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
     deployment_request_ids (use, or ignore for clients that number their goals; docs/demand.md),
     state_repo, fetch_interval, requester_queue_limit (how many demands of one requester may be
     without an answer), log_level (debug, info, warn, error or fatal). The parameter file of the
-    reference's node works too (docs/migration.md). Stop the node with Ctrl-C or SIGTERM: it
+    reference's node works too (docs/reference.md). Stop the node with Ctrl-C or SIGTERM: it
     publishes queued demands for some seconds, and the journal keeps the others for the next start.
 
     \b

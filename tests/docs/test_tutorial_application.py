@@ -10,27 +10,22 @@ from pathlib import Path
 
 from std_msgs.msg import Int32, String
 
-from tests.kit import pages
 from tests.kit.ros import Client, reserved
 
-PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "queue-warning" / "fleet"
+SCRIPTS = EXAMPLE / "appdefs" / "queue-warning" / "charts" / "ros-script" / "scripts"
 ARGUMENTS = {
     "density": ["/mast01/cars", "/mast01_density"],
     "warning": ["/ring_road_warning", "/mast01_density", "/mast02_density"],
 }
 
 
-def test_counted_cars_become_a_warning(tmp_path: Path) -> None:
-    scripts = {}
-    for block in pages.blocks(PAGE.read_text()):
-        if block.language == "python":
-            script = scripts[Path(block.title).stem] = tmp_path / Path(block.title).name
-            script.write_text(block.text)
-    assert scripts.keys() == ARGUMENTS.keys()
+def test_counted_cars_become_a_warning() -> None:
+    assert {script.stem for script in SCRIPTS.iterdir()} == ARGUMENTS.keys()
     with reserved() as domain, ExitStack() as stack:
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
         for name, topics in ARGUMENTS.items():
-            command = [sys.executable, scripts[name], *topics]
+            command = [sys.executable, SCRIPTS / f"{name}.py", *topics]
             service = stack.enter_context(subprocess.Popen(command, env=environment))
             stack.callback(service.kill)
         bus = Client(domain)

@@ -33,7 +33,7 @@ from demandops.model.config.load import load
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.repo.forge import ForgeError, Gitea, GitHub
-from demandops.repo.git import local_repository as addresses
+from demandops.repo.git import remote_repository as addresses
 from demandops.repo.history import commit_log, commit_message, revisions
 from demandops.serve import journal
 from demandops.serve.http_server import PushWebhook

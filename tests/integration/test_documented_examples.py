@@ -287,7 +287,8 @@ def test_the_instance_of_its_own_of_the_documentation() -> None:
 
 
 def test_the_rules_of_the_documentation_form_demands_that_are_booked() -> None:
-    near, more = (text for text in blocks("detector.md") if "kind: DetectorRules" in text)
+    (near,) = (text for text in blocks("detector.md") if "kind: DetectorRules" in text)
+    more = (DOCS.parent / "examples" / "detector" / "rules.yaml").read_text()
     start = datetime(2026, 5, 4, 4, 29, 30, tzinfo=timezone.utc).timestamp()  # a Monday
 
     def wanted(text: str, *steps: tuple[float, str, tuple[float, float], float]) -> list[Any]:

@@ -195,5 +195,5 @@ def test_what_changes_while_a_person_looks_at_it_is_not_merged(
         on.book(OTHER)
         asked.type("y\n")
         assert asked.end() == 1
-        assert f"{branch} is no longer at commit {seen}, so nothing was merged" in asked.text
+        assert f"{branch} is no longer at commit {seen}, so nothing was changed" in asked.text
     assert strict.tip == main

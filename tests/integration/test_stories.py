@@ -115,7 +115,7 @@ class Teller:
     def take(self, told: Any, patch: pytest.MonkeyPatch) -> None:
         repo = self.repo.path
         words = {"repo": str(repo), "url": repo.as_uri(), "first": root(repo)}
-        words["branch"] = next(iter(branches(repo)), "main")  # of a demand that waits
+        words["branch"] = next(iter(branches(repo, "demand/", "override/")), "main")  # a proposal's
         words["head"] = git(repo, "rev-parse", words["branch"])
         words |= {"tip": self.repo.tip, "clone": str(self.clone), "folder": str(self._folder)}
         step = Step.model_validate(_filled(told, words | self._names))

@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from demandops.model.demand.goals import read_journaled
-from demandops.repo.git.local_repository import LocalRepository
 from demandops.repo.git.remote_repository import RemoteRepository
+from demandops.repo.git.repository import StateRepository
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.proposal_branch import ProposalBranches
 from demandops.serve import worker
@@ -47,9 +47,9 @@ def tell(**event: object) -> None:
 _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
     "journaled": (True, [(Journal, "append")]),
     "committed": (True, [(CommitBatch, "commit")]),
-    "locked": (False, [(LocalRepository, "publish")]),
-    "publishing": (False, [(RemoteRepository, "publish"), (LocalRepository, "publish")]),
-    "published": (True, [(RemoteRepository, "publish"), (LocalRepository, "publish")]),
+    "locked": (False, [(StateRepository, "publish")]),
+    "publishing": (False, [(RemoteRepository, "publish"), (StateRepository, "publish")]),
+    "published": (True, [(RemoteRepository, "publish"), (StateRepository, "publish")]),
     "unanswered": (True, [(Journal, "mark_done")]),
     "proposing": (False, [(ProposalBranches, "put")]),
     "proposed": (True, [(ProposalBranches, "put")]),

@@ -295,8 +295,9 @@ def operations(repo: Path) -> list[str]:
     return [found for commit in commits(repo) if (found := commit.one("Operation-Id"))]
 
 
-def branches(repo: Path) -> list[str]:
-    return sorted(b for b in pygit2.Repository(str(repo)).branches.local if b.startswith("demand/"))
+def branches(repo: Path, *folders: str) -> list[str]:
+    names = pygit2.Repository(str(repo)).branches.local
+    return sorted(name for name in names if name.startswith(folders or "demand/"))
 
 
 def state_of(repo: Path, revision: str = "main") -> State:

@@ -19,7 +19,7 @@ from tests.kit.ros import Client, Serve
 
 FILES = plain_yaml.load(Path(__file__).with_name("parameters.yaml").read_text())
 EXPERIMENT = FILES["of the experiment"]
-PAGE = Path(__file__).parents[2] / "docs" / "migration.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference.md"
 
 
 @pytest.fixture

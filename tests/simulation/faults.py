@@ -383,9 +383,10 @@ def start_without_overrides(first: Any, *given: Any) -> Any:
     return replace(found, state=replace(found.state, config=config))
 
 
-@wrong(1, snapshot, "_claim_texts")
-def start_without_the_last_claim(texts: Any, *given: Any) -> Any:
-    return iter([*texts(*given)][:-1])
+@wrong(1, snapshot, "ledger_at")
+def start_without_the_last_claim(read: Any, *given: Any) -> Any:
+    found, *more = read(*given)
+    return found.without([*found][-1:]), *more
 
 
 _known = set[str]()

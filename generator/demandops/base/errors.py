@@ -48,17 +48,13 @@ class Fault:
 
     @property
     def place(self) -> str:
-        return place_text(self.file, self.line)
+        # editors and terminals turn `file:line` into a link
+        if self.line is None:
+            return self.file
+        return f"{self.file}:{self.line}" if self.file else f"line {self.line}"
 
     def within(self, file: str) -> Fault:
         return replace(self, file=file)
-
-
-def place_text(file: str, line: int | None) -> str:
-    # editors and terminals turn `file:line` into a link
-    if line is None:
-        return file
-    return f"{file}:{line}" if file else f"line {line}"
 
 
 class DemandOpsError(Exception):

@@ -10,18 +10,15 @@ contains nothing of the request but the host's name, because a URL or a header m
 from __future__ import annotations
 
 import logging
+import re
 import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from demandops import __version__
 from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
-
-if TYPE_CHECKING:
-    import httpx
 
 _MOST_BYTES = 4_000_000
 _INVALID = "the URL, a header or the proxy's address is not valid; check them"
@@ -32,6 +29,13 @@ _CAUSES = {
     "RemoteProtocolError": "the answer is not HTTP, or not complete; check the URL and the server",
     "ProxyError": "the proxy refuses the connection; check HTTPS_PROXY and ALL_PROXY",
 }
+
+# What to do about an error whose text has the words
+_REMEDIES = (
+    ("CERTIFICATE_VERIFY_FAILED.*mismatch", "use a host that the certificate names"),
+    ("CERTIFICATE_VERIFY_FAILED.*expired", "renew the certificate"),
+    ("CERTIFICATE_VERIFY_FAILED", "if you trust the certificate, set SSL_CERT_FILE to its file"),
+)
 
 for _name in ("httpx", "httpcore"):  # they log URLs and headers
     logging.getLogger(_name).setLevel(logging.WARNING)
@@ -70,6 +74,9 @@ def call(
     else:
         trust = ssl.create_default_context()
     end = REAL.monotonic() + 2 * timeout
+    too_slow = (
+        f"no complete answer within {timeout:g} s; check that the server runs and can be reached"
+    )
     try:
         with (  # httpx follows no redirect by itself, and so takes no token to another host
             httpx.Client(verify=trust, timeout=timeout) as client,
@@ -81,9 +88,9 @@ def call(
                 if len(content) > _MOST_BYTES:
                     raise NoAnswer(f"the answer is longer than {_MOST_BYTES} bytes; check the URL")
                 if REAL.monotonic() > end:
-                    raise NoAnswer(_too_slow(timeout))
+                    raise NoAnswer(too_slow)
             if REAL.monotonic() > end:  # the end of the answer may come late, too
-                raise NoAnswer(_too_slow(timeout))
+                raise NoAnswer(too_slow)
             return HttpAnswer(
                 answer.status_code,
                 answer.reason_phrase,
@@ -94,27 +101,15 @@ def call(
                 or (answer.is_error and answer.headers.get("x-ratelimit-remaining") == "0"),
             )
     except httpx.TimeoutException:
-        raise NoAnswer(_too_slow(timeout)) from None
+        raise NoAnswer(too_slow) from None
     except httpx.TransportError as error:
-        raise NoAnswer(_cause(error)) from None
+        if cause := _CAUSES.get(type(error).__name__):
+            raise NoAnswer(cause) from None
+        text = one_line(str(error) or type(error).__name__)
+        remedies = (remedy for words, remedy in _REMEDIES if re.search(words, text))
+        remedy = next(remedies, "check that the server runs and can be reached")
+        raise NoAnswer(f"{text}; {remedy}") from None
     except (httpx.InvalidURL, ValueError):
         raise NoAnswer(_INVALID) from None
     except ImportError:  # httpx needs a further package for SOCKS
         raise NoAnswer("a SOCKS proxy is set, but only HTTP proxies can be used") from None
-
-
-def _too_slow(timeout: float) -> str:
-    return f"no complete answer within {timeout:g} s; check that the server runs and can be reached"
-
-
-def _cause(error: httpx.TransportError) -> str:
-    if cause := _CAUSES.get(type(error).__name__):
-        return cause
-    text = one_line(str(error) or type(error).__name__)
-    if "CERTIFICATE_VERIFY_FAILED" in text:
-        if "mismatch" in text:
-            return f"{text}; use a host that the certificate names"
-        if "expired" in text:
-            return f"{text}; renew the certificate"
-        return f"{text}; if you trust the certificate, set SSL_CERT_FILE to its file"
-    return f"{text}; check that the server runs and can be reached"

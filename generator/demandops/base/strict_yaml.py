@@ -17,7 +17,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -174,10 +174,13 @@ def short_repr(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "…"
 
 
-@contextmanager
-def _strict(file: str) -> Iterator[None]:
+def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]:
+    # an error may come only after some documents
+    if len(text) > MAX_LENGTH:
+        message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
+        raise InvalidInput.at("", message, file=file)
     try:
-        yield
+        yield from Loader(text).documents(most)
     except yaml.YAMLError as error:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
         where = f"line {mark.line + 1}, column {mark.column + 1}" if mark else ""
@@ -188,15 +191,6 @@ def _strict(file: str) -> Iterator[None]:
         raise InvalidInput.at("", message, file=file) from error
     except InvalidInput as error:
         raise InvalidInput(faults_in(error, file)) from None
-
-
-def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]:
-    # an error may come only after some documents
-    if len(text) > MAX_LENGTH:
-        message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
-        raise InvalidInput.at("", message, file=file)
-    with _strict(file):
-        yield from Loader(text).documents(most)
 
 
 # Matches a field with a list of plain texts, as `to_json` writes it. The json module reads a list
@@ -383,19 +377,6 @@ def lines(text: str, document: int = 0) -> dict[str, int]:
     return by_field
 
 
-class FieldLines:
-    """Finds the lines of fields in files; reads each file only once."""
-
-    def __init__(self, text_of: Callable[[str], str | None]) -> None:
-        self._text_of = text_of
-        self._lines: dict[str, Mapping[str, int]] = {}
-
-    def of(self, file: str, field: str) -> int | None:
-        if field and file not in self._lines:
-            self._lines[file] = lines(self._text_of(file) or "")
-        return nearest(field, self._lines.get(file, {}))
-
-
 def nearest(field: str, lines: Mapping[str, int]) -> int | None:
     # the field of a fault may be missing in the file, or be only a part of a text
     while field and field not in lines:
@@ -404,9 +385,12 @@ def nearest(field: str, lines: Mapping[str, int]) -> int | None:
 
 
 def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) -> list[Fault]:
-    lines = FieldLines(text_of)
+    lines_of = cache(lambda file: lines(text_of(file) or ""))
     return [
-        replace(fault, line=fault.line or lines.of(fault.file, fault.field)) for fault in faults
+        replace(fault, line=nearest(fault.field, lines_of(fault.file)))
+        if fault.field and not fault.line
+        else fault
+        for fault in faults
     ]
 
 

@@ -177,7 +177,15 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
     return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value
 
 
+def decision_text(decision: Json) -> str:
+    unnamed = ", by whom Git does not say," if decision["outcome"] == "approved" else ""
+    who = f" by {decision['by']}" if decision["by"] else unnamed
+    reason = f": {decision['reason']}" if decision["reason"] else ""
+    return f"{decision['outcome']}{who} at {time_text(decision['time'])}{reason}"
+
+
 def commit_data(entry: LogEntry) -> Json:
+    answer = entry.answer
     return {
         "commit": entry.commit,
         "time": time_data(entry.time),
@@ -192,4 +200,5 @@ def commit_data(entry: LogEntry) -> Json:
         "applications": entry.trailers.get("Application", []),
         "connections": entry.trailers.get("Connection", []),
         "render_version": entry.first("Render-Version") or None,
+        "decision": asdict(answer) | {"time": time_data(answer.time)} if answer else None,
     }

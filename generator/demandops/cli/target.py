@@ -18,7 +18,7 @@ from demandops.base.quoting import quoted
 from demandops.base.strict_yaml import located_in
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, parse_file
 from demandops.repo import reader
-from demandops.repo.git.local_repository import checkout_around, is_url, origin_of
+from demandops.repo.git.remote_repository import checkout_around, is_url, origin_of
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.views import release_causes

@@ -64,7 +64,8 @@ class Decision:
     """The effect of a demand.
 
     ``files`` maps each path to the new text, or to ``None`` if the file is to be removed.
-    ``approval`` has the reasons why a person must approve the demand before it is booked.
+    ``approval`` has the reasons why a person must approve the demand before it is booked, and
+    ``approved_by`` the rules without which a person would have to.
     """
 
     request: Demand
@@ -75,6 +76,7 @@ class Decision:
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
     approval: tuple[str, ...] = ()
+    approved_by: tuple[str, ...] = ()
     # the paths of the overrides that change the content of the rendered files
     overrides: tuple[str, ...] = ()
     # whether waiting demands are tried again: services now request less of a node, or one of the
@@ -385,6 +387,8 @@ def _rendered(state: State, booked: _Booked, read: FileReader, checkpoint: Check
     usage = state.usage().plus(booked.grown)
     after = state.followed_by(booked.after.ledger, booked.planned, usage)
     checkpoint()
+    claims = [(change.before, change.after) for change in changes.claims]
+    required_by, approved_by = permission.approval(request, claims, config)
     outcome: Outcome = "unchanged"
     if changes.claims or changes.waiting or isinstance(request, Wait):
         outcome = _OUTCOMES.get(request.operation, "released")
@@ -401,11 +405,9 @@ def _rendered(state: State, booked: _Booked, read: FileReader, checkpoint: Check
             *(difference.warning() for difference in booked.differing),
         ),
         approval=_once(
-            *permission.approval_reasons(
-                request, ((c.before, c.after) for c in changes.claims), config
-            ),
-            *(difference.approval_reason() for difference in booked.differing),
+            *required_by, *(difference.approval_reason() for difference in booked.differing)
         ),
+        approved_by=approved_by,
         overrides=rendered.overrides,
         awaited=any(amount < 0 for amount in booked.grown.values())
         # a demand that waits for room for an application runs wherever another demand books it

@@ -6,12 +6,14 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from itertools import combinations, groupby, islice
 
 from demandops.base import strict_yaml
-from demandops.base.errors import Fault, fault, suggestion
+from demandops.base.errors import Fault, InvalidInput, fault, suggestion
+from demandops.base.quantities import amount_of
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, needed_access
@@ -32,7 +34,8 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import Changes, World
 from demandops.model.release import Release
-from demandops.templating.charts import overridden
+from demandops.templating.charts import defaults, overridden
+from demandops.templating.values import takes_requests
 
 # ---- missing inputs: topics that applications read or deliver, but that do not arrive ----
 #
@@ -262,6 +265,52 @@ def ignored_field_warnings(config: Config) -> Iterator[Fault]:
                 "upgrade`, which does so"
             )
             yield fault(ignored, message).within(path)
+
+
+# ---- requests that no node or no pod has ----
+
+
+def request_warnings(config: Config) -> Iterator[Fault]:
+    """Warn of what services request, but no node offers or Kubernetes cannot count."""
+    settings = config.repo_settings
+    services = {s.file + s.name: s for own in config.services.values() for s in own.values()}
+    for _, service in sorted(services.items()):
+        place = "requests" if service.shared else f"services.{service.name}.requests"
+        for name, amount in service.requests.items():
+            resource = settings.kubernetes_names.get(name, name)
+            known = f"{amount} {name}" + (f" ({resource})" if resource not in (None, name) else "")
+            # a node without a capacity has some cpu and memory, but nobody said that it has a GPU
+            is_usual = name in ("cpu", "memory")
+            if not any(
+                is_usual if most is None else most >= amount_of(amount)
+                for most in (node.most(name) for node in config.nodes.values())
+            ):
+                message = (
+                    f"service '{service.name}' requests {known}; no node of the inventory has as "
+                    "much, so its pods may wait for ever; add it to the capacity of nodes in "
+                    + config.place_of(NODES_FILE)
+                )
+                yield fault(f"{place}.{name}", message).within(service.file)
+            if resource and not settings.requests_of_pods({name: amount}):
+                message = (
+                    f"'{name}' is no resource of Kubernetes, so only the generator counts it; name "
+                    "it in 'resources' of demandops.yaml, with Kubernetes' name or with null"
+                )
+                if "/" in resource:
+                    message = f"pods do not get {known}, because Kubernetes gives only whole ones"
+                    message += "; write a whole number"
+                yield fault(f"{place}.{name}", message).within(service.file)
+        chart, template = config.charts.get(service.chart), config.values_template(service)
+        if not service.requests or chart is None or "requests" in config.files.get(template, ""):
+            continue
+        with suppress(InvalidInput):  # YAML that only Helm reads
+            if not chart.folder or not takes_requests(defaults(chart.folder, config.files)):
+                message = (
+                    f"writes no `requests`, and the chart '{service.chart}' is not known to have "
+                    f"`resources`, so the pods of service '{service.name}' request nothing; write "
+                    "`requests` where the chart reads them"
+                )
+                yield fault("", message).within(template)
 
 
 _TRUTH = re.compile(

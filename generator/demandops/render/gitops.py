@@ -140,9 +140,9 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
             "is 0, but an autoscaler keeps at least one replica; to run none, use 'deny' instead"
         )
         raise InvalidInput.at("replicas", message, file=by[-1])
-    task = ValuesTask(
-        template, _variables(release, config), release.chart.folder, tuple(release.shaping.patches)
-    )
+    variables = _variables(release, config)
+    patches = tuple(release.shaping.patches)
+    task = ValuesTask(template, variables, release.chart.folder, patches, variables["requests"])
     try:
         return evaluate(config.files, task)
     except InvalidInput as error:
@@ -158,9 +158,9 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
         raise type(error)(faults) from None
 
 
-def _variables(release: ServiceRelease, config: Config) -> dict[str, object]:
+def _variables(release: ServiceRelease, config: Config) -> dict[str, Any]:
     node = release.node
-    variables: dict[str, object] = {
+    variables: dict[str, Any] = {
         "release": release.name,
         "service": release.key.service,
         "node": {
@@ -187,7 +187,7 @@ def _variables(release: ServiceRelease, config: Config) -> dict[str, object]:
         },
         "outputs": dict(release.outputs),
         "parameters": dict(release.parameters),
-        "requests": dict(release.service.requests),
+        "requests": config.repo_settings.requests_of_pods(release.service.requests),
         "images": {name: release.image(name, config).parts() for name in release.service.images},
     }
     # Never both. A template that knows only ``replicas`` must fail, because the GitOps controller

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 import pygit2
-from pygit2 import Oid, Tree
+from pygit2 import Commit, Oid, Tree
 
 from demandops.base import settings
 from demandops.base.errors import InvalidInput, StateRepoError
@@ -21,10 +22,17 @@ from demandops.model.config.config import Config
 from demandops.model.demand.demand import Rollback
 from demandops.repo import verification
 from demandops.repo.git import tree as trees
-from demandops.repo.git.local_repository import LastFetch, connect, is_url, needs_push
-from demandops.repo.git.repository import StateRepository, access_error, reading
+from demandops.repo.git.remote_repository import connect, is_url
+from demandops.repo.git.repository import (
+    LastFetch,
+    StateRepository,
+    access_error,
+    needs_push,
+    reading,
+)
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
+from demandops.repo.history.commit_message import PROPOSAL
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Problem, Progress, Snapshot
@@ -37,6 +45,7 @@ class Reader:
 
     def __init__(self, repository: StateRepository, tip: Oid, slot: Slot | None = None) -> None:
         self.repository, self._tip, self._slot = repository, tip, slot
+        self._merged: tuple[Oid | None, Mapping[str, Commit]] = (None, {})  # of main at a commit
         self._objects = repository.objects
 
     @classmethod
@@ -156,8 +165,15 @@ class Reader:
         since, until = self._sides(spec or "")
         if path is not None:
             changes = commit_log.changes_to(self._objects, until, path, since)
-            return (change.entry for change in changes)
-        return (entry for _, entry in commit_log.commits(self._objects, until, since))
+            return (self._answered(change.entry) for change in changes)
+        entries = (entry for _, entry in commit_log.commits(self._objects, until, since))
+        return map(self._answered, entries)
+
+    def _answered(self, entry: LogEntry) -> LogEntry:
+        # which merges main has is looked up once, and only if somebody asks for a proposal's commit
+        if PROPOSAL in entry.trailers and self._merged[0] != self._tip:
+            self._merged = self._tip, commit_log.merges(self._objects, self._tip)
+        return commit_log.answered(self._objects, entry, self._tip, self._merged[1])
 
     def revisions(self, spec: str | None) -> list[str]:
         # oldest first; the commit REV, those after A up to B in ``A..B``, or the newest one
@@ -186,10 +202,16 @@ class Reader:
         for verdict in verification.verify(self._objects, commits, whole=whole):
             verdicts.append(verdict)
             progress(len(verdicts), len(commits))
-        return verification.with_signatures(self._objects, verdicts)
+        return verdicts
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
-        return commit_log.history_of(self._objects, revision, path, most)
+        history = commit_log.history_of(self._objects, revision, path, most)
+        return replace(
+            history,
+            started=history.started and self._answered(history.started),
+            newest=tuple(map(self._answered, history.newest)),
+            stopped=history.stopped and self._answered(history.stopped),
+        )
 
     def release_path(self, name: str, revision: str) -> str | None:
         return commit_log.release_path(self._objects, revision, name)

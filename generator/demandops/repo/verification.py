@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from urllib.parse import unquote
 
 import pygit2
-from pygit2 import Blob, Commit, GitError, Oid, Repository, Tree
+from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.settings import (
@@ -20,8 +19,6 @@ from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.appdef import without_ignored_fields
-from demandops.model.config.config import CONFIG_ROOTS
-from demandops.model.config.load import load as load_config
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
@@ -36,7 +33,6 @@ from demandops.repo.history.commit_log import LogEntry, entry_of
 from demandops.repo.history.commit_message import PROPOSAL
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
-from demandops.templating.evaluator import EVALUATE
 
 # ---- the files that a commit of the generator changed, but was not allowed to change ----
 #
@@ -73,13 +69,15 @@ def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> Itera
             continue
         if operation == "upgrade" and not blob and path.startswith(_GONE):
             continue
-        if operation == "upgrade" and (path == ROOT_FILE or _only_removes_ignored(commit, path)):
+        old, new = (trees.read_text(tree, path) for tree in (before, commit.tree))
+        # an upgrade takes fields out of definitions that are read no longer
+        only_removes = old is not None and without_ignored_fields(path, old) == new
+        if operation == "upgrade" and (path == ROOT_FILE or only_removes):
             continue
         if root != claim_files.LEDGER_ROOT:
             yield path
         elif path.startswith(f"{records.MARKERS_ROOT}/"):
-            text = trees.read_text(commit.tree, path) or ""
-            is_valid = not text or records.read_ended_override({path: text})
+            is_valid = not new or records.read_ended_override({path: new})
             if operation not in _ENDING or not is_valid:
                 yield path
         elif path.rsplit("/", 1)[-1] in named:
@@ -89,12 +87,6 @@ def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> Itera
             earlier is not None and trees.entry_id(earlier, path) == blob
         ):
             yield path
-
-
-def _only_removes_ignored(commit: Commit, path: str) -> bool:
-    # fields of a definition that are read no longer
-    before, after = (trees.read_text(tree, path) for tree in (commit.parents[0].tree, commit.tree))
-    return before is not None and without_ignored_fields(path, before) == after
 
 
 def _only_rewrites(commit: Commit, path: str) -> bool:
@@ -148,6 +140,10 @@ class Verdict:
     signed: bool = False  # whether the commit has a signature, valid or not
     signer: str = ""  # who signed, if a signature is required and valid; else why it is not
     signature: str = ""
+
+
+class _Unreadable(Exception):
+    """Raised when a commit cannot be verified because one of its files is not valid."""
 
 
 class _Proof:
@@ -221,18 +217,34 @@ class _Proof:
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
+    opened = [trees.commit_of(repo, revision) for revision in commits]
+    checks = signing.checks(repo, [commit for commit in opened if entry_of(commit).by_generator])
     proof: _Proof | None = None
-    for place, revision in enumerate(commits, 1):
-        commit = trees.commit_of(repo, revision)
+    for place, commit in enumerate(opened, 1):
         entry = entry_of(commit)
-        verdict = Verdict(entry.commit, entry.summary, True, _skip_reason(entry))
-        if verdict.skipped:
+        check = checks.get(entry.commit, signing.Check())
+        version, skipped = entry.first("Render-Version"), ""
+        if not entry.by_generator:
+            skipped = "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
+        elif version != str(RENDER_VERSION):
+            skipped = f"rendered by version {version}, but this program renders version "
+            skipped += str(RENDER_VERSION)
+        verdict = Verdict(
+            entry.commit,
+            entry.summary,
+            holds=not check.fault,
+            skipped=skipped,
+            signed=bool(signing.signature_of(commit)),
+            signer=check.signer,
+            signature=check.fault,
+        )
+        if skipped:
             yield verdict
             continue
         before, proof = proof, None  # proof stays None if the commit cannot be read
         try:
             verdict = replace(verdict, touched=tuple(sorted(disallowed_files(repo, commit, entry))))
-            if whole or place == len(commits) or entry.first("In-Force"):
+            if whole or place == len(commits):
                 state = _loaded(repo, commit, entry)
                 parent = trees.parent_tree(commit) if _holds(state) else None
                 held = trees.texts(parent, GENERATED_ROOTS) if parent is not None else {}
@@ -248,24 +260,18 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
                 differing = proof.differing()
         except _Unreadable as error:
             why = f"a file was not valid at this commit: {error}"
-            yield replace(verdict, skipped=why, holds=not verdict.touched)
+            yield replace(verdict, skipped=why, holds=verdict.holds and not verdict.touched)
         except InvalidInput as error:  # the generator could render the commit, so this is a fault
             yield replace(verdict, holds=False, fault=str(error.faults[0]))
         except StateRepoError as error:
             yield replace(verdict, holds=False, fault=str(error))
         else:
-            holds = not (differing or verdict.touched)
+            holds = verdict.holds and not (differing or verdict.touched)
             yield replace(verdict, holds=holds, differing=differing)
-
-
-class _Unreadable(Exception):
-    """Raised when a commit cannot be verified because one of its files is not valid."""
 
 
 def _loaded(repo: Repository, commit: Commit, entry: LogEntry) -> State:
     try:
-        if entry.first("In-Force"):
-            return _of_second_version(repo, commit, entry)
         snapshot = snapshots.load(repo, commit.id, entry=entry)
     except InvalidInput as error:
         raise _Unreadable(error.faults[0]) from None
@@ -274,40 +280,12 @@ def _loaded(repo: Repository, commit: Commit, entry: LogEntry) -> State:
     return snapshot.state
 
 
-def _of_second_version(repo: Repository, commit: Commit, entry: LogEntry) -> State:
-    # In the second version, files of several commits were in effect while one was not valid:
-    # ``Configuration`` names the commit of most, each ``Stands-In`` a file in another version, as
-    # path and blob, and each ``Held-Back`` a claim that was in effect as last written before. All
-    # files were valid at ``In-Force``.
-    source = entry.first("Configuration") or entry.first("In-Force")
-    files = trees.texts(trees.commit_of(repo, source).tree, CONFIG_ROOTS)
-    try:
-        for line in entry.trailers.get("Stands-In", ()):
-            path, _, blob = line.rpartition(" ")
-            files.pop(unquote(path), None)
-            if blob != "none":
-                files[unquote(path)] = trees.text_of(repo[blob].peel(Blob))
-    except (ValueError, KeyError, GitError):
-        raise StateRepoError(f"commit {commit.id} has unreadable trailers") from None
-    ledger, *_ = snapshots.ledger_at(repo, commit, entry=entry)
-    return State(load_config(files), ledger, EVALUATE)
-
-
 def _differing(wanted: Mapping[str, Oid], committed: Mapping[str, Oid]) -> tuple[str, ...]:
     return tuple(
         path
         for path in sorted({*wanted, *committed})
         if wanted.get(path) != committed.get(path) and not trees.is_readme(path)
     )
-
-
-def _skip_reason(entry: LogEntry) -> str:
-    if not entry.by_generator:
-        return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
-    version = entry.first("Render-Version")
-    if version != str(RENDER_VERSION):
-        return f"rendered by version {version}, but this program renders version {RENDER_VERSION}"
-    return ""
 
 
 def _holds(world: World) -> bool:
@@ -320,24 +298,3 @@ def _generated_files(tree: Tree) -> dict[str, Oid]:
 
 def _blob(text: str) -> Oid:
     return pygit2.hash(text.encode())
-
-
-# ---- signatures ----
-
-
-def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    pairs = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
-    checks = signing.checks(repo, [commit for _, commit in pairs if entry_of(commit).by_generator])
-    signed = []
-    for verdict, commit in pairs:
-        check = checks.get(verdict.commit, signing.Check())
-        signed.append(
-            replace(
-                verdict,
-                holds=verdict.holds and not check.fault,
-                signed=bool(signing.signature_of(commit)),
-                signer=check.signer,
-                signature=check.fault,
-            )
-        )
-    return signed

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import suppress
 from datetime import datetime, timedelta
+from functools import partial
 from math import inf
 from pathlib import Path
 from typing import Literal
@@ -117,9 +118,15 @@ class Agenda:
         check = (now if has_news else self._check_at) if main else inf
         if main and self._checked != main:
             check = min(check, self._check_new_main_at)
+        # what was left off goes on at once, but after the demands that arrived meanwhile
+        own_work = 0.0 if self.may_have_room(state) else LONGEST_WAIT_S
+        for end, name in _ends(state):
+            seconds = (end - self._runtime.now()).total_seconds() + 0.01
+            own_work = min(own_work, max(seconds, self.waits_s("end", name)))
+        own_work = min([own_work, *(self.waits_s("drain", node) for node in _to_drain(state))])
         due: dict[What, float] = {
             "leases": self._lease_ends_in(state.ledger),
-            "own work": max(self._own_work_in(state), self.waits_s("own work")),
+            "own work": max(own_work, self.waits_s("own work")),
             "fetch": fetch,
             # after a failure, the remote is likely away
             "check": max(check - now, self.waits_s("check")),
@@ -141,29 +148,17 @@ class Agenda:
         _, until = self._failed.get((what, name), (0.0, -inf))
         return max(0.0, until - self._runtime.monotonic())
 
-    def _forget_failures(self, config: Config) -> None:
-        # those that are long past, as vehicles come and go; and what a new configuration may mend
-        now, is_new = self._runtime.monotonic(), config is not self._config
-        self._config = config
-        for (what, name), (_, until) in [*self._failed.items()]:
-            if now >= until + LONGEST_WAIT_S or (name and is_new):
-                del self._failed[what, name]
-
     # ---- own work ----
 
-    def _own_work_in(self, state: State) -> float:
-        # what was left off goes on at once, but after the demands that arrived meanwhile
-        if self.may_have_room(state):
-            return 0.0
-        now = self._runtime.now()
-        waits = [self.waits_s("drain", node) for node in _to_drain(state)]
-        for end, name in _ends(state):
-            waits.append(max((end - now).total_seconds() + 0.01, self.waits_s("end", name)))
-        return min([*waits, LONGEST_WAIT_S])
-
     def commit_due(self, commits: CommitBatch) -> None:
-        self._forget_failures(commits.head.state.config)
         state, now = commits.head.state, self._runtime.now()
+        # forget failures that are long past, as vehicles come and go; and what a new configuration
+        # may mend
+        steady, is_new = self._runtime.monotonic(), state.config is not self._config
+        self._config = state.config
+        for (what, name), (_, until) in [*self._failed.items()]:
+            if steady >= until + LONGEST_WAIT_S or (name and is_new):
+                del self._failed[what, name]
         for end, name in sorted(_ends(state)):
             if end > now or self.waits_s("end", name):
                 continue
@@ -267,14 +262,9 @@ class Agenda:
         # The tickets are correct only now: later, a requester may renew a lease, or a person may
         # set the clock. If one does not release its claims, the next comes at least a minute later.
         now, claims = self.ended_claims(ledger)
-        demands = dict.fromkeys(claim.demand for claim in claims)
-        return [self._ticket(name, now) for name in demands if not self.waits_s("lease", name)]
+        tickets = list[Ticket]()
 
-    def _ticket(self, demand: str, now: datetime) -> Ticket:
-        request = Demand("expire", demand, demand=demand, is_complete=True)
-        ticket = Ticket(self._runtime.fresh_id(), request, now)
-
-        def tell(future: Future[Receipt]) -> None:
+        def tell(demand: str, future: Future[Receipt]) -> None:
             self.failed("lease", demand)
             error = future.exception()
             if isinstance(error, InvalidInput):  # no client gets this error, so report it here
@@ -283,8 +273,12 @@ class Agenda:
                 outcome = future.result().outcome
                 log.info("the lease of %s has ended: %s", quoted(demand), outcome)
 
-        ticket.future.add_done_callback(tell)
-        return ticket
+        for demand in dict.fromkeys(claim.demand for claim in claims):
+            if not self.waits_s("lease", demand):
+                request = Demand("expire", demand, demand=demand, is_complete=True)
+                tickets.append(Ticket(self._runtime.fresh_id(), request, now))
+                tickets[-1].future.add_done_callback(partial(tell, demand))
+        return tickets
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
         """Return the current time, and the claims whose lease has ended, earliest end first."""

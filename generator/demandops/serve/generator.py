@@ -14,7 +14,7 @@ from demandops.base.runtime import REAL, Runtime
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import read_goal
-from demandops.repo.git.local_repository import connect
+from demandops.repo.git.remote_repository import connect
 from demandops.repo.git.repository import access_error, reading
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import revisions

@@ -227,7 +227,9 @@ class Journal:
             self._rewrite()
 
     def drop_requests(self) -> list[Path]:
-        return sorted(self._path.parent.glob(f"{_DROP}*"))
+        with suppress(OSError):  # the next look tries again
+            return sorted(self._path.parent.glob(f"{_DROP}*"))
+        return []
 
     def require_sound(self) -> None:
         if self._unsound is not None:

@@ -21,7 +21,6 @@ from demandops.base.errors import (
 )
 from demandops.base.runtime import Runtime
 from demandops.base.settings import MAIN_BRANCH, RENDER_VERSION
-from demandops.decide.booking import Restoration
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand, Rollback
@@ -83,16 +82,6 @@ class RemoteMonitor:
         self.status = RemoteStatus()
         self._away_from = self._denied_from = 0.0
 
-    def record_unreachable(self, reason: str) -> None:
-        since = self.status.unreachable_since
-        if since is None:
-            log.warning("%s; trying again until the state repo is back", reason)
-            self._away_from = self._runtime.monotonic()  # as a person may set the other clock
-        else:
-            log.debug("%s", reason)
-        since = since or self._runtime.now()
-        self.status = replace(self.status, unreachable=reason, unreachable_since=since)
-
     def record_reached(self, *, pushed: bool = False) -> None:
         now, before = self._runtime.now(), self.status
         if before.unreachable_since is not None:
@@ -104,17 +93,26 @@ class RemoteMonitor:
             last_push=now if pushed else before.last_push,
         )
 
-    def record_push_denied(self, reason: str) -> float:
-        # returns for how many seconds all pushes are denied
-        now = self._runtime.monotonic()
-        if self.status.push_denied:
-            log.debug("%s", reason)
+    def record_failure(self, reason: str, *, is_denied: bool = False) -> float:
+        """Return for how many seconds the remote, which can be read, has denied all pushes."""
+        now, before = self._runtime.monotonic(), self.status
+        if is_denied:
+            self.record_reached()
+            self.status = replace(self.status, push_denied=reason)
+            if before.push_denied:
+                log.debug("%s", reason)
+            else:
+                log.error("%s", reason)
+                self._denied_from = now
+            return now - self._denied_from
+        if before.unreachable_since is None:
+            log.warning("%s; trying again until the state repo is back", reason)
+            self._away_from = now  # as a person may set the other clock
         else:
-            self._denied_from = now
-            log.error("%s", reason)
-        self.record_reached()
-        self.status = replace(self.status, push_denied=reason)
-        return now - self._denied_from
+            log.debug("%s", reason)
+        since = before.unreachable_since or self._runtime.now()
+        self.status = replace(before, unreachable=reason, unreachable_since=since)
+        return 0.0
 
 
 # ---- the worker ----
@@ -401,7 +399,10 @@ class Worker:
         try:
             demand: Demand = ticket.demand
             if isinstance(demand, Rollback):
-                demand = self._restoration(demand, commits.start)
+                if not self._repository.includes(str(commits.start.commit), demand.to):
+                    message = f"commit {demand.to} is not in the history of the state repo; roll "
+                    raise Refused([fault("", f"{message}back to one that is")])
+                demand = restoration(self._repository.objects, demand)
             state = commits.head.state
             # of all services, once for each configuration; that is not this demand's work
             state.usage()
@@ -456,21 +457,15 @@ class Worker:
             reason = disk_error(error, self._repository.address)
             if reason is not None:  # the state repo fails, so no demand can be evaluated
                 raise reason from None
-            if (
-                getattr(error, "errno", None) is None
-            ):  # a file that only this demand reads may be damaged
+            # a file that only this demand reads may be damaged
+            if getattr(error, "errno", None) is None:
                 told = access_error(error, self._repository.address, self._repository.objects)
                 if isinstance(told, StateRepoError):
+                    if self._repository.renew_if_damaged():
+                        raise Unavailable(f"{told}; the clone is made anew") from None
                     return told
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return internal(error)
-
-    def _restoration(self, rollback: Rollback, head: Snapshot) -> Restoration:
-        to = rollback.to
-        if not self._repository.includes(str(head.commit), to):
-            message = f"commit {to} is not in the history of the state repo; roll back to one that "
-            raise Refused([fault("", f"{message}is")])
-        return restoration(self._repository.objects, rollback)
 
     def _published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
         # Oldest first, the results of those demands that main records already. They have no answer
@@ -608,10 +603,15 @@ class Worker:
                 self._try_to_carry_out_changes()
             # a deleted branch may have been merged, which only a main as new as ``heads`` shows
             if self._repository.includes(str(self.snapshot.commit), heads.main):
-                self._approvals.check(self.snapshot, heads)
+                self._approvals.check(self.snapshot, heads, self._publish_record)
                 self._agenda.checked(str(self.snapshot.commit))
         except (Unavailable, PushDenied) as error:
             log.warning("%s; the demands that await approval keep waiting", error)
+
+    def _publish_record(self, commits: CommitBatch) -> bool:
+        if is_published := commits.publish():
+            self._record_published(commits)
+        return is_published
 
     def _try_to_carry_out_changes(self, *, again: bool = False) -> None:
         try:
@@ -717,8 +717,7 @@ class Worker:
         self._demands.blocked = str(error)
         if isinstance(error, PushDenied):
             self._agenda.fetched(reached=True)
-            return self.remote.record_push_denied(str(error))
-        self.remote.record_unreachable(str(error))
-        pause = error.retry_after_s if isinstance(error, Unavailable) else 0.0
-        self._agenda.fetched(reached=False, at_least_s=pause)
-        return 0.0
+        else:
+            pause = error.retry_after_s if isinstance(error, Unavailable) else 0.0
+            self._agenda.fetched(reached=False, at_least_s=pause)
+        return self.remote.record_failure(str(error), is_denied=isinstance(error, PushDenied))

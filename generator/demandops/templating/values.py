@@ -9,7 +9,7 @@ import re
 import traceback
 from collections.abc import Callable, ItemsView, Iterable, Iterator, KeysView, Mapping, ValuesView
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
@@ -21,6 +21,7 @@ from jinja2.sandbox import ImmutableSandboxedEnvironment
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path
+from demandops.base.quantities import amount_of
 from demandops.base.quoting import quoted
 from demandops.templating import charts
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
@@ -138,6 +139,8 @@ class ValuesTask:
     chart: str | None  # its folder, if it is in the state repo
     # The values of overrides in the order in which they apply, each with the override's path
     patches: tuple[tuple[str, Any], ...] = ()
+    # What each pod requests of its node, by Kubernetes' names
+    requests: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def file(self) -> str:
@@ -169,6 +172,8 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
     text = _rendered(files, task)
     try:
         values = _mapping(text, task.template)
+        if task.chart and task.requests:
+            values = _with_requests(values, task.requests, charts.defaults(task.chart, files))
         if task.chart:
             _check(values, task.chart, files, task.template, "the template")
     except InvalidInput as error:
@@ -184,6 +189,31 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
         if task.chart:
             _check(values, task.chart, files, override, "the override")
     return values
+
+
+def takes_requests(defaults: Mapping[str, Any]) -> bool:
+    """Return whether a chart with these default values gives its pods what a service requests."""
+    return isinstance(defaults.get("resources"), dict)
+
+
+def _with_requests(
+    values: dict[str, Any], requests: Mapping[str, str], defaults: Mapping[str, Any]
+) -> dict[str, Any]:
+    # above what the chart has by default, and below what the template writes
+    written = values.get("resources", {})
+    if not takes_requests(defaults) or not isinstance(written, dict):
+        return values
+    most, limits = defaults["resources"].get("limits") or {}, {}
+    for name, amount in requests.items():
+        # Kubernetes refuses other requests than limits of a GPU, and requests above a limit
+        with suppress(ValueError):  # a limit in a form that only Kubernetes reads
+            if "/" in name or (name in most and amount_of(amount) > amount_of(str(most[name]))):
+                limits[name] = amount
+    for part, amounts in (("requests", requests), ("limits", limits)):
+        own = written.get(part, {})
+        if amounts and isinstance(own, dict):
+            written = {**written, part: {**amounts, **own}}
+    return {**values, "resources": written}
 
 
 _COMPILED = CompiledTemplates()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from tests.e2e.rig.kube import Kube, Manifest, build_manifest
 
 _RBAC = "rbac.authorization.k8s.io"
 _ACCOUNT = "generator"
-_STATUS_PAGE = Path(__file__).parents[3] / "docs" / "status.md"
+_DEPLOY = Path(__file__).parents[3] / "deploy"
 
 
 def access_file(folder: Path, clusters: Mapping[str, Mapping[str, object]]) -> Path:
@@ -24,11 +23,8 @@ def access_file(folder: Path, clusters: Mapping[str, Mapping[str, object]]) -> P
 
 
 def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
-    """Return the role rules that docs/status.md lists for a controller, by namespace."""
-    name = {"flux": "flux", "argocd": "argo cd"}[gitops]
-    blocks = re.findall(r"```yaml\n(.*?)```", _STATUS_PAGE.read_text(), re.DOTALL)
-    (block,) = [text for text in blocks if f"# with {name}\n" in text.lower()]
-    roles = list(yaml.safe_load_all(block))
+    """Return the role rules of deploy/ for a controller, by namespace."""
+    roles = list(yaml.safe_load_all((_DEPLOY / f"status-role.{gitops}.yaml").read_text()))
     return {role["metadata"]["namespace"]: role["rules"] for role in roles}
 
 

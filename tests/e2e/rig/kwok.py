@@ -5,7 +5,9 @@ from __future__ import annotations
 from .kube import Manifest, build_manifest
 
 NODE_ID_LABEL = "node_id"  # releases select nodes by it
-_CAPACITY = {"cpu": "64", "memory": "256Gi", "ephemeral-storage": "1Ti", "pods": "1000"}
+_CAPACITY = {"cpu": "64", "memory": "256Gi", "ephemeral-storage": "1Ti", "pods": "1000"} | {
+    "nvidia.com/gpu": "8"
+}
 
 
 def manifest(node_id: str) -> Manifest:

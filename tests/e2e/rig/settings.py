@@ -31,7 +31,7 @@ def existing(name: str) -> Existing | None:
         missing = "E2E_GIT_URL" if kubeconfig else "E2E_KUBECONFIG"
         raise RigError(
             f"{missing} is not set: an existing cluster needs E2E_KUBECONFIG and E2E_GIT_URL "
-            "(docs/e2e.md); unset both and the tests start a cluster of their own"
+            "(tests/e2e/README.md); unset both and the tests start a cluster of their own"
         )
     path = Path(kubeconfig).expanduser().resolve()
     if not path.is_file():

@@ -85,6 +85,26 @@ def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_
     assert rig.tip(bare) == commit.id, "a fast-forward merge must need no further commit"
 
 
+def test_who_rejects_a_demand_tells_its_requester_why_also_while_no_generator_runs(
+    address: str, bare: Path, petra: Person
+) -> None:
+    reject = ["--reason", "The road is closed", "--state-repo", address, "--yes"]
+    told = "was turned down by Petra Platform: The road is closed (commit "
+    with rig.running(address) as generator:
+        one, two = (Proposed(generator, put(name, 1)) for name in ("one", "two"))
+        assert run(["reject", one.branch, *reject]) == 0
+        assert one.outcome() == "TurnedDown"
+        assert str(one.ticket.future.exception()).startswith(told)
+    assert run(["reject", two.branch, *reject]) == 0
+    tip = rig.tip(bare)
+    assert rig.restart(address) is True
+    assert rig.tip(bare) == tip and branches(bare) == []
+    records = rig.commits(bare)[-2:]
+    assert [record.one("Demand-Id") for record in records] == ["one", "two"]
+    assert [record.one("Requester") for record in records] == ["user", "user"]
+    assert git(bare, "log", "-1", "--format=%an") == "Petra Platform"
+
+
 def test_a_requester_may_have_only_so_many_proposals(
     bare: Path, petra: Person, generator: Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -273,8 +273,8 @@ def test_a_clone_that_cannot_be_read_meanwhile_is_named_and_waited_for(
 def lose(repo: Path, tmp_path: Path, spec: str) -> str:
     """Remove an object from a bare repository; return its id."""
     lost = rig.git(repo, "rev-parse", spec).strip()
-    packs = [path.replace(tmp_path / path.name) for path in repo.glob("objects/pack/*.pack")]
-    for pack in packs:
+    moved = [path.replace(tmp_path / path.name) for path in repo.glob("objects/pack/*")]
+    for pack in (path for path in moved if path.suffix == ".pack"):
         with pack.open("rb") as file:
             subprocess.run(["git", "unpack-objects", "-q"], cwd=repo, stdin=file, check=True)
     (repo / "objects" / lost[:2] / lost[2:]).unlink()
@@ -356,20 +356,31 @@ def test_a_remote_that_does_not_answer_is_told(url: str, tmp_path: Path) -> None
     assert message.startswith(f"{url} cannot be pushed to: fatal: git timed out after 0.2 s; check")
 
 
+def _lose_the_fusion(repo: Path) -> str:
+    """Remove the rendered file of the fusion that goal 1 has started; return its path."""
+    (path,) = [each for each in git(repo, "ls-tree", "-r", "--name-only", "main").split()
+               if "/of-" in each]  # fmt: skip
+    lose(repo, repo.parent, f"main:{path}")
+    return path
+
+
 def test_a_damaged_file_fails_only_demands_that_read_it_and_is_named(bare: Path) -> None:
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
-    (path,) = [each for each in git(bare, "ls-tree", "-r", "--name-only", "main").split()
-               if "/of-" in each]  # fmt: skip
-    blob = git(bare, "rev-parse", f"main:{path}").strip()
-    packs = sorted((bare / "objects" / "pack").glob("*"))
-    for pack in packs:
-        shutil.move(pack, bare / pack.name)
-    for pack in sorted(bare.glob("*.pack")):
-        subprocess.run(["git", "unpack-objects", "-q"], cwd=bare, stdin=pack.open(), check=True)
-    (bare / "objects" / blob[:2] / blob[2:]).unlink()
+    path = _lose_the_fusion(bare)
     with rig.running(bare) as generator:
         reads, other = generator.submit(goal(6)), generator.submit(goal(2))  # 6 has the fusion of 1
         with pytest.raises(StateRepoError, match=f"{path} of commit .* is missing or damaged"):
             rig.receipt(reads)
         assert rig.receipt(other).outcome == "booked"
+
+
+def test_a_file_that_only_a_clone_has_lost_is_fetched_again(url: str, bare: Path) -> None:
+    with rig.running(url) as generator:
+        rig.book(generator, goal(1))
+        clone = generator._slot.folder / "clone.git"
+    git(clone, "branch", "main", "refs/remotes/origin/main")
+    _lose_the_fusion(clone)
+    with rig.running(url) as generator:
+        rig.book(generator, goal(6))  # has the fusion of goal 1
+    rig.assert_sound(bare)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from demandops.repo.git.local_repository import connect
+from demandops.repo.git.remote_repository import connect
 
 from tests.kit import rig
 from tests.kit.rig import Person

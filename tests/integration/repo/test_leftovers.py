@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from demandops.base.errors import StateRepoError, Unsound
-from demandops.repo.git.local_repository import LocalRepository
+from demandops.repo.git.repository import StateRepository
 from demandops.serve.journal import Journal
 
 from tests.kit import rig
@@ -21,9 +21,9 @@ def _leave(bare: Path) -> list[Path]:
     folder = bare / "demandops-pack-killed"
     folder.mkdir()
     (folder / "pack_git2_1").write_text("half of a pack")
-    index = next((bare / "objects" / "pack").glob("*.idx"))
-    keep = index.with_suffix(".keep")
-    keep.hardlink_to(index)
+    pack = next((bare / "objects" / "pack").glob("*.pack"))
+    keep = pack.with_suffix(".keep")
+    keep.write_text("demandops\n")
     return [folder, keep]
 
 
@@ -82,7 +82,7 @@ def test_a_journal_whose_sync_fails_answers_nobody(
 def test_a_repo_that_borrows_objects_is_refused(bare: Path, tmp_path: Path) -> None:
     git(tmp_path, "clone", "--quiet", "--bare", "--shared", str(bare), "borrows.git")
     with pytest.raises(StateRepoError, match="borrows objects of another repository"):
-        LocalRepository(tmp_path / "borrows.git")
+        StateRepository(tmp_path / "borrows.git")
 
 
 @pytest.mark.parametrize(
@@ -101,4 +101,4 @@ def test_a_branch_that_cannot_be_read_is_told_with_the_remedy(
     branch.write_text(text)
     remedy = f"{what}.*; check its disk .* restore them from a backup"
     with pytest.raises(StateRepoError, match=remedy):
-        LocalRepository(bare)
+        StateRepository(bare)

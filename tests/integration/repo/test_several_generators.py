@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.repo.git import local_repository
+from demandops.repo.git import repository
 from demandops.repo.git.objects import NewObjects
 from demandops.serve.generator import Generator
 
@@ -58,7 +58,7 @@ def test_what_another_writer_publishes_in_the_last_moment_is_not_overwritten(
 ) -> None:
     """Between a generator's last look at main and its own move of it."""
     places: dict[str, tuple[Any, str]] = {
-        "the tip was read": (local_repository, "needs_push"),
+        "the tip was read": (repository, "needs_push"),
         "the branch was read": (NewObjects, "packed"),
     }
     owner, name = places[after]

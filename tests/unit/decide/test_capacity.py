@@ -15,10 +15,10 @@ from typing import Any
 
 import pytest
 from demandops.base.errors import Refused
+from demandops.base.quantities import amount_of, amount_text
 from demandops.decide.decision import Decision
 from demandops.decide.placement.capacity import whole_usage
 from demandops.decide.state import State
-from demandops.model.config.inventory import amount_of, amount_text
 from demandops.model.config.load import load
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.model.ledger.records import in_turn

@@ -1,7 +1,11 @@
-"""``policy-warnings.yaml`` lists what ``demandops check`` warns of in a valid configuration."""
+"""What ``demandops check`` warns of in a valid configuration.
+
+``policy-warnings.yaml`` and ``request-warnings.yaml`` list it.
+"""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +16,10 @@ from demandops.model.config.load import load
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, state_of
 from tests.kit.memory import MemoryRepo
-from tests.unit.model.test_config_mistakes import changed
+from tests.unit.model.test_config_mistakes import APPDEF, changed
 
 CASES = plain_yaml.load(Path(__file__).with_name("policy-warnings.yaml").read_text())
+REQUESTS = plain_yaml.load(Path(__file__).with_name("request-warnings.yaml").read_text())
 
 
 def told(case: dict[str, Any]) -> list[str]:
@@ -28,6 +33,16 @@ def told(case: dict[str, Any]) -> list[str]:
 def test_exactly_what_is_listed_is_warned_of(name: str) -> None:
     found = told(CASES[name])
     for words, one in zip(CASES[name]["warns"], found, strict=True):
+        assert words in one
+
+
+@pytest.mark.parametrize("name", REQUESTS)
+def test_requests_that_no_node_or_pod_has_are_told(name: str) -> None:
+    case = {key: part for key, part in REQUESTS[name].items() if key not in ("warns", "requests")}
+    appdef = {"prefix: of": f"…\n    requests: {json.dumps(REQUESTS[name]['requests'])}"}
+    files = configuration(changed({**case, APPDEF: appdef}))
+    found = map(str, warnings.request_warnings(load(files)))
+    for words, one in zip(REQUESTS[name]["warns"], found, strict=True):
         assert words in one
 
 

@@ -10,32 +10,21 @@ import yaml
 from demandops.connections.connection import ROUTE_OPTIONS
 from demandops.connections.connection_types import CONNECTION_TYPES
 
-from tests.kit.config import skeleton
 from tests.kit.memory import MemoryRepo
 
-PAGE = (Path(__file__).parents[3] / "docs" / "connections.md").read_text()
+ROOT = Path(__file__).parents[3]
+EXAMPLE = ROOT / "examples" / "connections"
+PAGE = (ROOT / "docs" / "connections.md").read_text()
 
 
 def blocks(language: str) -> list[str]:
     return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
 
 
-def titled() -> dict[str, str]:
-    """Return the YAML blocks whose first line is a comment with a path, by that path."""
-    found = {}
-    for block in blocks("yaml"):
-        title, _, text = block.partition("\n")
-        if title.startswith("# "):
-            found[title.removeprefix("# ")] = text
-    return found
-
-
 def test_the_example_gives_what_the_page_says() -> None:
-    files = titled()
-    more = files.pop("registry/images.yaml, one more")
-    request = yaml.safe_load(files.pop("demand.yaml"))
-    images = {"registry/images.yaml": skeleton()["registry/images.yaml"] + more}
-    books = MemoryRepo({**files, **images})
+    found = {str(path.relative_to(EXAMPLE)): path.read_text() for path in EXAMPLE.rglob("*.yaml")}
+    request = yaml.safe_load(found.pop("demand.yaml"))
+    books = MemoryRepo(found)
     decision = books.send(request)
 
     clients = books.objects("ConfigMap")

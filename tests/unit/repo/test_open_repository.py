@@ -9,7 +9,7 @@ import pygit2
 import pytest
 from demandops.base.addresses import without_secrets
 from demandops.base.errors import StateRepoError
-from demandops.repo.git.local_repository import connect, is_url
+from demandops.repo.git.remote_repository import connect, is_url
 from demandops.repo.git.repository import RemoteAway
 
 from tests.kit import plain_yaml

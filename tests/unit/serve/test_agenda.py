@@ -161,7 +161,7 @@ def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCapt
     remote = RemoteMonitor("https://git.example/state.git", clock)
     remote.record_reached()
     for _ in range(3):
-        remote.record_unreachable("cannot be fetched: no route")
+        remote.record_failure("cannot be fetched: no route")
     assert remote.status.unreachable == "cannot be fetched: no route"
     clock.pass_(90)
     for _ in range(3):
@@ -174,7 +174,7 @@ def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCapt
 
 def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) -> None:
     remote = RemoteMonitor("somewhere", clock)
-    remote.record_push_denied("takes no push: frozen")
+    remote.record_failure("takes no push: frozen", is_denied=True)
     remote.record_reached()
     assert (remote.status.push_denied, remote.status.unreachable) == ("takes no push: frozen", "")
     remote.record_reached(pushed=True)

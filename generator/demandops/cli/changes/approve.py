@@ -15,10 +15,13 @@ from demandops.cli.json_output import output_option, show
 from demandops.cli.output import done, errors
 from demandops.cli.queries.diff import differences, entry_lines, release_lines
 from demandops.cli.target import names_of, signing_option, writable_repo_option
+from demandops.repo.git.repository import PushDenied
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails
 from demandops.repo.write.proposal_branch import (
+    OF_PEOPLE,
+    BranchMoved,
     PendingProposal,
     ProposalBranches,
     pending_proposals,
@@ -54,10 +57,11 @@ def _proposal(repo: Reader, name: str, commit: str, output: str) -> PendingPropo
     if commit:
         proposal.require(commit)
     if output == "text":
+        who = f"for {', '.join(proposal.requesters)}" if proposal.requesters else proposal.author
         for line in (
             f"{proposal.branch} at commit {proposal.commit}",
             f"  {proposal.summary}",
-            f"  for {', '.join(proposal.requesters)}, proposed {proposal.since:%F %H:%M} UTC",
+            f"  {who}, proposed {proposal.since:%F %H:%M} UTC",
             *(f"  required by {reason}" for reason in proposal.required_by),
             *(f"  changed: it replaces {old}" for old in proposal.replaces),
         ):
@@ -82,7 +86,7 @@ def approve(
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Approve a proposed demand: merge its branch in your own name.
+    """Approve a proposal: merge its branch in your own name.
 
     At a terminal, the command first shows what the merge would change, and asks. Elsewhere, and
     with --yes, name the commit that you looked at: --commit ID. If the branch is at another commit,
@@ -118,6 +122,8 @@ def approve(
         details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
         merged = person_commit.merge(repo.repository, proposal, details)
         done.append(f"{proposal.branch} is merged in {merged.commit}")
+        if proposal.branch.startswith(OF_PEOPLE):  # a generator removes only its own branches
+            _remove(repo, proposal)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": merged.commit}
     show(output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"])
 
@@ -127,25 +133,52 @@ def approve(
 
 @click.command()
 @click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals"))
+@person_change.reason_option
 @commit_option
 @person_change.yes_option
 @writable_repo_option
+@signing_option
 @output_option
-def reject(name: str, commit: str, yes: bool, state_repo: str, output: str) -> None:
-    """Turn a proposed demand down: delete its branch.
+def reject(
+    name: str,
+    reason: str,
+    commit: str,
+    yes: bool,
+    state_repo: str,
+    signing_key: Path | None,
+    output: str,
+) -> None:
+    """Reject a proposal: record that on main in your own name, and delete its branch.
 
-    The generator then aborts the goal with `turned-down`. If the branch has changed since the
-    command read it, the command deletes nothing.
+    The requester gets the reason; the generator aborts the goal with `turned-down`. If the branch
+    has changed since the command read it, the command changes nothing.
 
     \b
     Examples:
-      demandops reject demand/visit-3f2a9c1b04de
-      demandops reject visit --yes
+      demandops reject visit -m "The road is closed"
+      demandops reject demand/visit-3f2a9c1b04de --yes
     """
-    with person_change.writable(state_repo, None) as repo:
+    with person_change.writable(state_repo, signing_key) as repo:
         proposal = _proposal(repo, name, commit, output)
-        person_change.confirm("Turn it down?", yes, output)
+        person_change.confirm("Reject it?", yes, output)
+        summary = f"Reject {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
+        details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
+        recorded = None
+        try:
+            recorded = person_commit.reject(repo.repository, proposal, details).commit
+            done.append(f"commit {recorded} rejects {proposal.branch}")
+        except PushDenied as denied:  # who may not write to main may still close a proposal
+            errors.print(f"warning: your name and reason are not recorded: {denied}")
+        _remove(repo, proposal)
+    data = {"outcome": "rejected", "branch": proposal.branch, "commit": recorded}
+    where = f"recorded in {recorded}, " if recorded else ""
+    show(output, data, [f"rejected: {where}{proposal.branch} is deleted"])
+
+
+def _remove(repo: Reader, proposal: PendingProposal) -> None:
+    try:
         ProposalBranches(repo.repository).remove(proposal.branch, proposal.commit)
+    except BranchMoved as moved:  # main has the answer, which stands
+        errors.print(f"warning: {moved}, so it was not deleted; look at it and delete it")
+    else:
         done.append(f"{proposal.branch} is deleted")
-    data = {"outcome": "rejected", "branch": proposal.branch, "commit": proposal.commit}
-    show(output, data, [f"turned down: {proposal.branch} is deleted"])

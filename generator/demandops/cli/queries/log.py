@@ -11,7 +11,14 @@ import click
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import Json, commit_data, output_formats, show, time_text
+from demandops.cli.json_output import (
+    Json,
+    commit_data,
+    decision_text,
+    output_formats,
+    show,
+    time_text,
+)
 from demandops.cli.output import busy
 from demandops.cli.table import Table, column, table_of
 from demandops.cli.target import name_options, state_repo_option
@@ -24,7 +31,7 @@ from demandops.repo.reader import Reader
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
     *("join", "shutdown", "put", "release", "renew", "expire", "wait", "decommission", "drain"),
-    *("follow", "expire-override", "rollback", "upgrade", "init", "by-hand"),
+    *("follow", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
 )
 
 _TRAILERS = {
@@ -164,13 +171,20 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
 _COLUMNS = (
     column("Commit", lambda row, now: row["commit"][:10]),
     column("When", lambda row, now: relative(parse_time(row["time"]), now), 2),
-    column("What", "summary", wraps=True),
+    column(
+        "What",
+        lambda row, now: [
+            row["summary"],
+            *([decision_text(row["decision"])] if row["decision"] else []),
+        ],
+        wraps=True,
+    ),
     column(
         "Requesters",
         lambda row, now: (
             # the trailers name the requesters whose claims changed; a person asked for it
             f"{row['author']}, for {', '.join(row['requesters'])}"
-            if row["operation"] == "rollback"
+            if row["operation"] in ("rollback", "reject")
             else ", ".join(row["requesters"]) or row["author"]
         ),
         1,

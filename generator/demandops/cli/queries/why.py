@@ -12,7 +12,14 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli import json_output
-from demandops.cli.json_output import Json, commit_data, override_data, release_data, time_text
+from demandops.cli.json_output import (
+    Json,
+    commit_data,
+    decision_text,
+    override_data,
+    release_data,
+    time_text,
+)
 from demandops.cli.output import at_option, busy
 from demandops.cli.queries.diff import loaded
 from demandops.cli.queries.get import effect_words
@@ -302,6 +309,8 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
     yield f"  {entry['commit'][:10]} {when}  {word}, {entry['author']}: {entry['summary']}"
     if why and entry["why"]:
         yield f"    {entry['why']}"
+    if entry["decision"]:
+        yield f"    {decision_text(entry['decision'])}"
     for each in entry["carries_out"]:
         yield f"    carries out commit {each['commit'][:10]} of {each['author']}: {each['summary']}"
 

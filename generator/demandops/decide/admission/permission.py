@@ -175,14 +175,17 @@ def lease_in(domain: AccessDomain, request: Demand) -> Lease | None:
     return Lease(seconds, seconds_of(policy.slack)) if seconds else None
 
 
-def approval_reasons(
+def approval(
     request: Demand, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
-) -> tuple[str, ...]:
-    """Return why a request needs approval, by its changed claims as (before, after)."""
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what requires a person's approval, and the rules that let requesters do without it.
+
+    ``changes`` are the changed claims as (before, after).
+    """
     if not request.adds_claims:
-        return ()
+        return (), ()
     listed = set(request.subjects())  # without the claims of overrides, which need no approval
-    reasons: dict[str, None] = {}
+    reasons, exempting = dict[str, None](), dict[str, None]()
     for before, after in changes:
         if after is None or after.subject not in listed:
             continue
@@ -202,10 +205,13 @@ def approval_reasons(
                 ]
                 # one rule that grants the access without approval is enough
                 if any((rule.approval or domain.approval) == "none" for rule in granting):
+                    free = [rule.name for rule in granting if rule.approval == "none"]
+                    for name in free if domain.approval == "required" else ():
+                        exempting[f"rule '{name}' of access domain '{domain.name}'"] = None
                     continue
                 requiring = [rule.name for rule in granting if rule.approval == "required"]
                 for name in requiring:
                     reasons[f"rule '{name}' of access domain '{domain.name}'"] = None
                 if not requiring and domain.approval == "required":
                     reasons[f"access domain '{domain.name}'"] = None
-    return tuple(reasons)
+    return tuple(reasons), tuple(exempting)

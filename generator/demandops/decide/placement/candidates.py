@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, Refused, suggestion
+from demandops.base.quantities import amount_of
 from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
 from demandops.decide.placement import capacity
@@ -25,7 +26,7 @@ from demandops.decide.planning.release_keys import is_needed
 from demandops.model.config import inventory
 from demandops.model.config.appdef import Place, Service
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
-from demandops.model.config.inventory import Node, Position, amount_of
+from demandops.model.config.inventory import Node, Position
 from demandops.model.demand.demand import Application, Item, Requirement
 from demandops.model.ledger.ledger import World
 from demandops.model.release import ServiceKey

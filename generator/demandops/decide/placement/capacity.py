@@ -14,11 +14,12 @@ from rpds import HashTrieMap
 
 from demandops.base.errors import Refused, fault
 from demandops.base.naming import SubjectKind
+from demandops.base.quantities import amount_of, amount_text
 from demandops.decide.planning import release_keys
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.config import NODES_FILE, Config
-from demandops.model.config.inventory import Node, amount_of, amount_text
+from demandops.model.config.inventory import Node
 from demandops.model.ledger.ledger import ClaimChange, World
 from demandops.model.release import Release, ServiceRelease, most_replicas
 

@@ -320,7 +320,7 @@ def may_wait(request: Demand, state: State, checkpoint: Callable[[], None]) -> b
             )
             claims = (Claim(held, "", request.id, item.requesters, _NEVER) for held in waiting)
             # A person approves only what can be booked at once, so what needs approval cannot wait.
-            if all(permission.approval_reasons(request, [(None, c)], state.config) for c in claims):
+            if all(permission.approval(request, [(None, c)], state.config)[0] for c in claims):
                 return False
     return True
 

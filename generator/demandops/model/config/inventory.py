@@ -19,6 +19,7 @@ from pydantic import (
 
 from demandops.base import addresses, strict_yaml
 from demandops.base.naming import id_problem, message_type_problem, topic_problem
+from demandops.base.quantities import amount_of
 from demandops.base.quoting import quoted
 from demandops.model.config import base_model
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
@@ -233,36 +234,6 @@ class Wan(CamelModel):
                 f"lastPort {self.last_port} is below firstPort {self.first_port}; swap them"
             )
         return self
-
-
-_QUANTITY = re.compile(r"([0-9]{1,15})(?:\.([0-9]{1,3}))?(m|k|M|G|T|Ki|Mi|Gi|Ti)?")
-_FACTORS = {"m": 1, "": 1000} | {
-    unit: 1000 * base**power
-    for base, units in ((1000, ("k", "M", "G", "T")), (1024, ("Ki", "Mi", "Gi", "Ti")))
-    for power, unit in enumerate(units, 1)
-}
-
-
-@lru_cache(maxsize=1024)
-def amount_of(text: str) -> int:
-    """Return a quantity in thousandths; exponents and the units above Ti are refused."""
-    match = _QUANTITY.fullmatch(text)
-    if match is None:
-        raise ValueError(f"{quoted(text)} is not a quantity; write one like 2, 500m, 1.5 or 16Gi")
-    whole, decimals, unit = match.groups(default="")
-    amount, remainder = divmod(int(whole + decimals.ljust(3, "0")) * int(_FACTORS[unit]), 1000)
-    if remainder:
-        raise ValueError(f"{quoted(text)} is finer than a thousandth; round it")
-    return amount
-
-
-def amount_text(amount: int, resource: str) -> str:  # of thousandths
-    if resource.endswith(("memory", "storage")):
-        for unit in ("Ti", "Gi", "Mi", "Ki"):
-            if amount and amount % _FACTORS[unit] == 0:
-                return f"{amount // _FACTORS[unit]}{unit}"
-    whole, decimals = divmod(amount, 1000)
-    return f"{whole}.{decimals:03}".rstrip("0") if decimals else str(whole)
 
 
 # A quantity as Kubernetes writes it, like `500m`. A plain number needs no quotes.

@@ -65,10 +65,16 @@ def load(files: Mapping[str, str]) -> Config:
     domains = reader.read_items(
         configs.DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name"
     )
+    settings = repository or _ANY
+    for id, node in nodes.items():
+        file, place = reader.places[configs.NODES_FILE][id]
+        if node.capacity is not None:
+            named = _with_short_names(node.capacity, settings, reader, file, f"{place}.capacity")
+            nodes[id] = node.model_copy(update={"capacity": named})
     appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
     services = {
-        name: _services_of(appdef, definitions, nodes.values(), reader)
+        name: _services_of(appdef, definitions, nodes.values(), settings, reader)
         for name, appdef in appdefs.items()
     }
     clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
@@ -104,7 +110,7 @@ def load(files: Mapping[str, str]) -> Config:
         for collection, places in reader.places.items()
     }
     config = Config(
-        repo_settings=repository or _ANY,
+        repo_settings=settings,
         clusters=clusters,
         nodes={id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()},
         brokers=brokers,
@@ -170,6 +176,7 @@ def _services_of(
     appdef: ApplicationDefinition,
     definitions: Mapping[str, ServiceDefinition],
     nodes: Iterable[Node],
+    settings: RepoSettings,
     reader: ConfigReader,
 ) -> Services:
     files = {f"appdefs/{name}/service.yaml" for name in appdef.uses.keys() - definitions.keys()}
@@ -180,14 +187,29 @@ def _services_of(
         reader.add_fault(f"appdefs/{appdef.name}/appdef.yaml", where, problem)
     services = dict(resolved)
     for name, service in resolved.items():
+        if service.requests:
+            place = "requests" if service.shared else f"services.{name}.requests"
+            named = _with_short_names(service.requests, settings, reader, service.file, place)
+            services[name] = service.model_copy(update={"requests": named})
         if service.nodes:
             runs_at = {}
             for node in nodes:
                 if service_node := service.nodes.get(node.cluster):
                     further = (id_in_domain(node.id, d.name) for d in node.access_domains)
                     runs_at.update(dict.fromkeys((node.id, *further), service_node))
-            services[name] = service.model_copy(update={"runs_at": runs_at})
+            services[name] = services[name].model_copy(update={"runs_at": runs_at})
     return services
+
+
+def _with_short_names(
+    amounts: Mapping[str, str], settings: RepoSettings, reader: ConfigReader, file: str, place: str
+) -> dict[str, str]:
+    # one name for each resource, so that placement need not know that it has two
+    named = settings.with_short_names(amounts)
+    for name in amounts.keys() - named.keys() if len(named) < len(amounts) else ():
+        (short,) = settings.with_short_names({name: ""})
+        reader.add_fault(file, place, f"'{name}' and '{short}' are one resource; keep one of them")
+    return named
 
 
 def is_override_name(name: str) -> bool:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
-from pydantic import StringConstraints, model_validator
+from pydantic import Field, StringConstraints, model_validator
 
 from demandops.base.addresses import as_git_url, holds_secret, url, without_secrets
+from demandops.base.quantities import amount_of
 from demandops.base.quoting import quoted
 from demandops.model.config import base_model
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel, Positive
+from demandops.model.config.inventory import ResourceName
 
 ROOT_FILE = "demandops.yaml"
 
@@ -115,6 +119,10 @@ class Limits(CamelModel):
     decision_milliseconds: Positive = 500
 
 
+# What every Kubernetes node may have; any other resource has a domain in front: `nvidia.com/gpu`
+_OF_KUBERNETES = re.compile("cpu|memory|ephemeral-storage|hugepages-.+")
+
+
 class RepoSettings(FileModel):
     """``demandops.yaml``: the settings of the whole state repo.
 
@@ -130,6 +138,44 @@ class RepoSettings(FileModel):
     proposals: Proposals = Proposals()
     limits: Limits = Limits()
     placement: Literal["nearest", "spread", "pack"] = "nearest"
+    # Short names of resources; without a name of Kubernetes, only the generator counts it
+    resources: dict[ResourceName, ResourceName | None] = Field(default_factory=dict)
     signed_off_by: (
         Annotated[str, StringConstraints(pattern=r"^[^<>\s][^<>\n]* <[^<>\s]+@[^<>\s]+>$")] | None
     ) = None
+
+    @model_validator(mode="after")
+    def _one_name_each(self) -> RepoSettings:
+        names = self.kubernetes_names
+        for name, resource in names.items():
+            if "/" in name or _OF_KUBERNETES.fullmatch(name):
+                raise ValueError(f"resources: '{name}' is Kubernetes' own name; leave it out")
+            if resource and "/" not in resource:
+                raise ValueError(
+                    f"resources: '{resource}' has no domain; write one like nvidia.com/gpu"
+                )
+            if resource and (others := [n for n in names if n != name and names[n] == resource]):
+                raise ValueError(
+                    f"resources: '{name}' and '{others[0]}' are both {resource}; keep one name, or "
+                    "give 'gpu' another resource, or null"
+                )
+        return self
+
+    @property
+    def kubernetes_names(self) -> dict[str, str | None]:
+        return {"gpu": "nvidia.com/gpu", **self.resources}
+
+    def with_short_names(self, amounts: Mapping[str, str]) -> dict[str, str]:
+        short = {resource: name for name, resource in self.kubernetes_names.items() if resource}
+        return {short.get(name, name): amount for name, amount in amounts.items()}
+
+    def requests_of_pods(self, requests: Mapping[str, str]) -> dict[str, str]:
+        """Return what Kubernetes' scheduler can count of a service's requests, by its own names."""
+        named = ((self.kubernetes_names.get(name, name), of) for name, of in requests.items())
+        return {
+            name: amount
+            for name, amount in sorted(named, key=str)
+            # Kubernetes refuses a name of no domain, and a part of a GPU
+            if name
+            and (_OF_KUBERNETES.fullmatch(name) or ("/" in name and amount_of(amount) % 1000 == 0))
+        }

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import hashlib
 import os
 import re
 import shutil
-import subprocess
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
@@ -20,7 +18,7 @@ import pygit2
 from gitdb.base import OStream
 from gitdb.pack import PackEntity
 from pygit2 import Oid, Repository, Signature, Tree
-from pygit2.enums import ObjectType
+from pygit2.enums import FileMode, ObjectType
 
 from demandops.repo.git.signing import Signer
 from demandops.repo.git.tree import printable
@@ -56,9 +54,7 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
 UNFINISHED = "demandops-pack-"  # the prefix of the folders in which packs are built
-# The errors raised if a file system has no hard links, or a file has too many.
-_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-_INDEX = b"\xfftOc"  # the first bytes of the index of a pack
+_KEEP = b"demandops\n"  # the content of our files that keep a pack
 
 # An entry of a tree object: the mode, the name and the raw id.
 _ENTRY = re.compile(rb"(([0-7]+) ([^\0]+)\0.{20})", re.DOTALL)
@@ -197,64 +193,19 @@ class NewObjects(pygit2.OdbBackend):
             yield
             return
         objects = [(oid, *self._unpacked[oid]) for oid in needed]
-        with self._placed(lambda folder: write_pack(folder, objects)):
-            for oid in needed:
-                del self._unpacked[oid]
-            yield
-
-    @contextmanager
-    def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
-        """Write a new synced pack with the objects that ``commit`` has and ``since`` lacks.
-
-        If ``since`` is unknown here, the pack has all objects of ``commit``. The repository has
-        them already, but an earlier sync of them may have failed.
-        """
-        without = f"^{since}\n" if since and since in self._repo else ""
-
-        def copy(folder: Path) -> Path:
-            done = subprocess.run(
-                # packing each object anew reads and checks it
-                ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
-                 "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
-                cwd=self._repo.path,
-                input=f"{commit}\n{without}",
-                capture_output=True,
-                text=True,
-                check=False,
-            )  # fmt: skip
-            if done.returncode:
-                raise pygit2.GitError(done.stderr.strip())
-            # iterdir, because glob would hide that the folder cannot be read
-            (pack,) = [path for path in folder.iterdir() if path.suffix == ".pack"]
-            return pack
-
-        with self._placed(copy):
-            yield
-
-    @contextmanager
-    def _placed(self, build: Callable[[Path], Path]) -> Iterator[None]:
         with _locked(self._packs, fcntl.LOCK_SH):
             folder = Path(mkdtemp(dir=self._packs.parents[1], prefix=UNFINISHED))
             keep: Path | None = None
             try:
-                pack = build(folder)
-                index, keep = pack.with_suffix(".idx"), self._packs / f"{pack.stem}.keep"
-                keep.unlink(missing_ok=True)
-                try:  # git removes no pack that has a .keep file
-                    keep.hardlink_to(index)  # which is synced already, so this costs no sync
-                except OSError as error:
-                    if error.errno not in _NO_LINKS:
-                        raise
-                    unplaced = index.with_suffix(".keep")
-                    with unplaced.open("wb") as file:
-                        file.write(_INDEX)
-                        file.flush()
-                        os.fsync(file.fileno())
-                    unplaced.replace(keep)
+                pack = write_pack(folder, objects)
+                keep = self._packs / f"{pack.stem}.keep"
+                keep.write_bytes(_KEEP)  # git removes no pack that has such a file
                 # the pack comes first, because git removes an index without a pack
-                pack.replace(self._packs / pack.name)
-                index.replace(self._packs / index.name)
+                for file in (pack, pack.with_suffix(".idx")):
+                    file.replace(self._packs / file.name)
                 sync_folder(self._packs)
+                for oid in needed:
+                    del self._unpacked[oid]
                 yield
             finally:
                 # What stays is removed at the next start. For the folder itself, rmtree raises some
@@ -265,15 +216,37 @@ class NewObjects(pygit2.OdbBackend):
                 with suppress(OSError):
                     shutil.rmtree(folder, ignore_errors=True)
 
+    def read_again(self, commit: Oid, since: str) -> None:
+        """Hold the objects that ``commit`` has and ``since`` lacks in memory, as if they were new.
+
+        If ``since`` is unknown here, these are all objects of ``commit``. They are on the disk, but
+        an earlier sync of them may have failed; reading one checks it.
+        """
+        walker = self._repo.walk(commit)
+        queue, seen = list[Oid](), set[Oid]()
+        if since and since in self._repo:
+            walker.hide(since)
+            queue.append(self._repo[since].peel(pygit2.Commit).tree_id)
+            while queue:
+                seen.add(oid := queue.pop())
+                queue += _ids_in(self._repo, oid)
+        for each in walker:
+            queue += [each.id, each.tree_id]
+        while queue:
+            if (oid := queue.pop()) in seen:
+                continue
+            seen.add(oid)
+            kind, data = self._repo.odb.read(oid)
+            self._unpacked[oid] = (ObjectType(kind), data)
+            queue += _ids_in(self._repo, oid)
+
     def clean(self) -> None:
         # of what killed processes left, unless another process writes a pack now
         with suppress(OSError), _locked(self._packs, fcntl.LOCK_EX | fcntl.LOCK_NB):
             for folder in Path(self._repo.path).glob(f"{UNFINISHED}*"):
                 shutil.rmtree(folder, ignore_errors=True)
             for keep in self._packs.glob("*.keep"):
-                with keep.open("rb") as file:  # a person's .keep does not begin like an index
-                    is_ours = file.read(len(_INDEX)) == _INDEX
-                if is_ours:
+                if keep.read_bytes() == _KEEP:  # a person may have made one too
                     keep.unlink()
 
     # ---- called by libgit2 ----
@@ -297,6 +270,13 @@ class NewObjects(pygit2.OdbBackend):
 
     def refresh_cb(self) -> None:
         pass  # memory is always current
+
+
+def _ids_in(repo: Repository, oid: Oid) -> list[Oid]:
+    # of a tree's files and folders, without submodules, whose commits are elsewhere
+    tree = repo[oid]
+    entries = tree if isinstance(tree, Tree) else ()
+    return [child.id for child in entries if child.filemode != FileMode.COMMIT]
 
 
 @contextmanager

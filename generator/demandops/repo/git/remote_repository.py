@@ -23,20 +23,25 @@ from pathlib import Path
 import pygit2
 from pygit2 import Oid, Repository
 
-from demandops.base.addresses import without_secrets
+from demandops.base.addresses import holds_secret, without_secrets
 from demandops.base.errors import StateRepoError
-from demandops.base.quoting import one_line
+from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
-from demandops.repo.git import child_processes, slow_git
-from demandops.repo.git import repository as repositories
+from demandops.repo.git import child_processes
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.repository import (
     MAIN,
+    TIMEOUT_S,
+    Checkout,
     FetchInterrupted,
     PushDenied,
     RemoteAway,
+    StateRepository,
     Unavailable,
+    access_error,
+    missing_main,
+    needs_push,
 )
 
 log = logging.getLogger("demandops")
@@ -165,6 +170,17 @@ _REMEDIES = (
 _NO_FILE = re.compile(r"unable to access '[^':]*':.*")
 
 
+# ---- who is told that git takes long with a remote ----
+
+_listeners: list[Callable[[str], None]] = []
+
+
+def listen(listener: Callable[[str], None]) -> None:
+    # It replaces the earlier one. A slow run of git calls it each second with a text about what git
+    # does, and with an empty text when git has ended.
+    _listeners[:] = [listener]
+
+
 # ---- the clone ----
 
 _REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
@@ -186,7 +202,7 @@ _PUSH = (
 )  # fmt: skip
 
 
-class RemoteRepository(repositories.StateRepository):
+class RemoteRepository(StateRepository):
     """A state repo behind a URL, in a bare clone."""
 
     always_current = False
@@ -268,7 +284,7 @@ class RemoteRepository(repositories.StateRepository):
     def _fetch(
         self,
         urgent: Callable[[], bool] = lambda: False,
-        timeout: float = repositories.TIMEOUT_S,
+        timeout: float = TIMEOUT_S,
     ) -> None:
         # The refspec is not in git's configuration. If it were, a push that outlives its generator
         # would move the reference.
@@ -280,7 +296,7 @@ class RemoteRepository(repositories.StateRepository):
             listing = ("ls-remote", "--quiet", "--exit-code", self._url, MAIN)
             listed = self._run_git(*listing, urgent=urgent)
             if listed.code == 2 and not listed.is_page:
-                raise repositories.missing_main(self.address)
+                raise missing_main(self.address)
         raise self._read_error("fetched", fetched)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
@@ -293,7 +309,7 @@ class RemoteRepository(repositories.StateRepository):
             with self.new.packed(commit):
                 pushed = self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except (pygit2.GitError, OSError) as error:
-            raise repositories.access_error(error, f"the clone {self._folder}") from None
+            raise access_error(error, f"the clone {self._folder}") from None
         if not pushed.took(MAIN):
             if pushed.line_of(MAIN)[0] == "[rejected]":  # git sent nothing
                 return False
@@ -317,10 +333,10 @@ class RemoteRepository(repositories.StateRepository):
         pairs = (line.split("\t", 1) for line in listed.out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
-    def fetch_branches(self, prefix: str) -> None:
+    def fetch_branches(self, *prefixes: str) -> None:
         # what the remote has deleted, this clone deletes too
-        spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
-        fetched = self._run_git(*_FETCH, "--prune", self._url, spec)
+        specs = (f"+refs/heads/{each}*:refs/remotes/origin/{each}*" for each in prefixes)
+        fetched = self._run_git(*_FETCH, "--prune", self._url, *specs)
         if fetched.code:
             raise self._read_error("fetched", fetched)
 
@@ -380,7 +396,7 @@ class RemoteRepository(repositories.StateRepository):
         self,
         *command: str,
         urgent: Callable[[], bool] = lambda: False,
-        timeout: float = repositories.TIMEOUT_S,
+        timeout: float = TIMEOUT_S,
     ) -> GitResult:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
@@ -408,7 +424,8 @@ class RemoteRepository(repositories.StateRepository):
                 took = REAL.monotonic() - start
                 if int(took) > told:
                     told, doing = int(took), _DOING.get(command[0], "asking")
-                    slow_git.tell(f"{doing} {self.address}, {told} s")
+                    for listener in _listeners:
+                        listener(f"{doing} {self.address}, {told} s")
                 self.while_waiting()
                 if urgent():
                     raise FetchInterrupted("the fetch was interrupted by a demand")
@@ -419,8 +436,8 @@ class RemoteRepository(repositories.StateRepository):
             if process.returncode is None:
                 _terminate(process)
             self._process = None
-            if told:
-                slow_git.tell("")
+            for listener in _listeners if told else ():
+                listener("")
         texts = [text.decode("utf-8", "replace") for text in (out, err)]
         code, took = process.returncode, REAL.monotonic() - start
         if code < 0:
@@ -446,3 +463,115 @@ def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
         with suppress(subprocess.TimeoutExpired):
             return process.communicate(timeout=patience)
     raise AssertionError("a killed process has ended")  # pragma: no cover
+
+
+# ---- a repository on this disk whose hooks and settings only `git push` obeys ----
+
+
+class PushedRepository(RemoteRepository):
+    on_this_disk = True
+
+    def __init__(self, place: StateRepository, folder: Path, notify: Notify) -> None:
+        self._place = place
+        super().__init__(str(Path(place.objects.path).resolve()), folder, notify, False)
+
+    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
+        # to look is cheap, to fetch is not; git says why the repository cannot be read
+        with suppress(pygit2.GitError, KeyError, OSError, StateRepoError):
+            if self._place.tip() == self.tip():
+                return self.tip()
+        return super().refresh(urgent)
+
+    def tidy(self) -> None:
+        super().tidy()
+        self._place.tidy()
+
+
+# ---- addresses: a folder, or a URL that Git can clone ----
+
+_SCHEME = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]*)(://|::)")
+_SCP = re.compile(r"^([^/\s:]+:(?!:)|[^/\s:]+@\[[^\]/]+\]:)")
+_NO_HOST = re.compile(r"^(https?|ssh|git|git\+ssh)://([^/@]*@)?(:\d*)?(/|$)")
+_ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
+
+
+def is_checkout(folder: Path) -> bool:
+    return (folder / ".git").exists() and (folder / "demandops.yaml").is_file()
+
+
+def checkout_around(folder: Path) -> Path | None:
+    return next(filter(is_checkout, (folder, *folder.parents)), None)
+
+
+def origin_of(checkout: Path) -> str | None:
+    try:
+        remotes = {remote.name: remote.url for remote in Repository(str(checkout)).remotes}
+    except pygit2.GitError:
+        return None
+    return remotes.get("origin")
+
+
+def is_url(address: str) -> bool:
+    try:
+        exists = Path(address).exists()
+    except OSError:  # the address is too long, or in a folder that this user cannot read
+        exists = False
+    # like git, which takes an existing folder ``a:b`` for a folder
+    return not exists and bool(_SCHEME.match(address) or _SCP.match(address))
+
+
+def connect(
+    address: str,
+    folder: Path,
+    notify: Notify = lambda text: None,
+    *,
+    allow_offline: bool = False,
+    only_read: bool = False,
+) -> StateRepository:
+    """Return the state repo at an address: a URL, or a folder where main is not checked out.
+
+    The clone of what is pushed to is made in ``folder``; with ``allow_offline``, an existing one is
+    used if its remote is away. With ``only_read``, the address may also be that of a checkout.
+    """
+    if is_url(address):
+        scheme = _SCHEME.match(address)
+        # git would start a program for other schemes: ``ext::COMMAND``, or git-remote-SCHEME
+        if scheme and (scheme[2] == "::" or scheme[1] not in _ALLOWED):
+            raise StateRepoError(
+                f"a state repo's address cannot start with '{scheme[0]}'; use https, ssh, git or "
+                "file"
+            )
+        if holds_secret(address):
+            raise StateRepoError(
+                "the state repo's address holds a password or token, which process lists would "
+                "show; remove it and use a credential helper, ~/.netrc or an SSH key"
+            )
+        if no_host := _NO_HOST.match(address):
+            raise StateRepoError(
+                f"the state repo's address names no host after '{no_host[1]}://'; write "
+                f"{no_host[1]}://HOST/PATH, or the folder of a bare repository"
+            )
+        return RemoteRepository(address, folder / "clone.git", notify, allow_offline)
+    try:
+        path = Path(address).expanduser()
+        is_folder, exists = path.is_dir(), path.exists()
+        is_read_only = is_checkout(path) and only_read
+    except (OSError, ValueError, RuntimeError) as error:  # for example ``~x`` without a user x
+        reason = getattr(error, "strerror", None) or str(error)
+        raise StateRepoError(
+            f"{quoted(address)} cannot be opened: {reason}; name the folder of a state repo"
+        ) from None
+    if exists and not is_folder:
+        raise StateRepoError(f"{address} is not a folder; name the folder of a state repo")
+    if not is_folder:
+        place = "" if path.is_absolute() else f" in {Path.cwd()}"
+        raise StateRepoError(
+            f"{address} does not exist{place}; correct the path, or make a state repo there with "
+            f"`demandops init {address} --bare`"
+        )
+    if is_read_only:
+        return Checkout(path)
+    repository = StateRepository(path)
+    if only_read or not needs_push(address):
+        return repository
+    return PushedRepository(repository, folder / "clone.git", notify)

@@ -1,12 +1,12 @@
-"""The base class of state repos, on this disk or behind a URL, and the errors of both."""
+"""State repos on this disk, what is only read of one, and the errors of all state repos."""
 
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import re
 import subprocess
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
@@ -21,11 +21,16 @@ from demandops.base.settings import MAIN_BRANCH
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
-from demandops.repo.git.objects import NewObjects
+from demandops.repo.git.objects import NewObjects, sync_folder
 from demandops.repo.git.signing import Signer
 
 MAIN = f"refs/heads/{MAIN_BRANCH}"
 TIMEOUT_S = 120
+# From this age on, a branch's lock counts as left behind by a killed process: Git locks a branch
+# only for milliseconds.
+_STALE_LOCK_S = 5.0
+
+log = logging.getLogger("demandops")
 
 
 class Unavailable(StateRepoError):
@@ -159,29 +164,179 @@ def reading(address: str, objects: Repository) -> Iterator[None]:
         raise access_error(error, address, objects) from None
 
 
-class StateRepository(ABC):
-    # `publish` only moves the tip forward. `refresh` may move it back, if somebody has
-    # rewritten main.
+# ---- whether only git can write a repository on this disk as its owner wants ----
 
-    objects: Repository
-    new: NewObjects
-    address: str
+_HOOKS = ("pre-receive", "update", "post-receive", "post-update", "reference-transaction")
+# What a push may do, and who may read what it writes. The objects that this program makes would
+# pass git's check of objects, and it always keeps them packed.
+_SETTINGS = re.compile(
+    r"core\.sharedrepository|transfer\.hiderefs|hook\..*|receive\.(?!fsckobjects$|unpacklimit$).*"
+)
+
+
+def needs_push(address: str) -> bool:
+    """Return whether a folder has a repository with hooks or settings that only git obeys."""
+    try:
+        repo = Repository(os.path.expanduser(address))  # noqa: PTH111 - the other one raises errors
+        settings = {entry.name.lower(): entry.value or "" for entry in repo.config}
+    except (pygit2.GitError, ValueError):
+        return False
+    hooks = Path(repo.path, os.path.expanduser(settings.get("core.hookspath", "hooks")))  # noqa: PTH111
+    return any(map(_SETTINGS.fullmatch, settings)) or any(
+        (hooks / name).is_file() and os.access(hooks / name, os.X_OK) for name in _HOOKS
+    )
+
+
+# ---- a bare repository on this disk ----
+
+
+class StateRepository:
+    """A bare repository on this disk, written in place and fsynced; nobody has main checked out.
+
+    Its subclass :class:`remote_repository.RemoteRepository` is behind a URL. `publish` only moves
+    the tip forward. `refresh` may move it back, if somebody has rewritten main.
+    """
+
     signer: Signer | None = None
     runtime: Runtime = REAL
     # called again and again while this waits for git
     while_waiting: Callable[[], object] = staticmethod(lambda: None)
-    always_current: bool  # whether the tip needs no fetch, as in a repository on this disk
-    on_this_disk = False  # whether it costs nearly nothing to look for new commits
-    _tidying: subprocess.Popen[bytes] | None = None
+    always_current = True  # whether the tip needs no fetch
+    on_this_disk = True  # whether it costs nearly nothing to look for new commits
     # of the tip: main, its remote-tracking branch, or HEAD of a checkout
     main_reference = MAIN
-    # the prefix of the references of branches
-    branches = "refs/heads/"
+    branches = "refs/heads/"  # the prefix of the references of branches
+    _tidying: subprocess.Popen[bytes] | None = None
+    _lock_seen: tuple[tuple[int, int], float] | None = None
+
+    def __init__(self, path: Path) -> None:
+        self.address = str(path)
+        objects = open_folder(path)
+        if objects is None:
+            raise StateRepoError(
+                f"{path} is not a Git repository; name another folder, or make one in a new folder "
+                "with `demandops init DIR --bare`"
+            )
+        self.objects, self.new = objects, NewObjects(objects)
+        try:
+            self._require_usable(path)
+            _ = self.objects[self.tip()].peel(pygit2.Commit).tree
+        except (pygit2.GitError, KeyError, OSError) as error:
+            raise access_error(error, self.address, self.objects) from None
+
+    def _require_usable(self, path: Path) -> None:
+        borrowed = Path(self.objects.path) / "objects" / "info" / "alternates"
+        if borrowed.exists():
+            raise StateRepoError(
+                f"{path} borrows objects of another repository, which may remove them; copy them "
+                f"with `git -C {path} repack -a -d`, then remove {borrowed}"
+            )
+        self.new.clean()
+        self.tip()
+        if self.objects.is_shallow or lacks_objects(self.objects):
+            raise StateRepoError(
+                f"{path} is a clone that lacks a part of the history or of the files; clone the "
+                "state repo again, without --depth and --filter"
+            )
+        if self.objects.branches.local[MAIN_BRANCH].is_checked_out():
+            raise StateRepoError(
+                f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
+                f"use a bare clone: git clone --bare {path} {path}.git"
+            )
 
     def tip(self) -> Oid:
-        target = self.objects.references[self.main_reference].target
-        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
-        return target
+        main = self.objects.references.get(self.main_reference)
+        if main is None:
+            raise missing_main(self.address)
+        if not isinstance(main.target, Oid):
+            raise StateRepoError(
+                f"the branch '{MAIN_BRANCH}' of {self.address} is only another name of "
+                f"{main.target}; make it a branch: git -C {self.address} update-ref --no-deref "
+                f"{MAIN} {main.target}"
+            )
+        return main.target
+
+    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
+        """Fetch and return the newest published commit.
+
+        If ``urgent`` returns true before the fetch ends, git is ended and FetchInterrupted is
+        raised, so that a demand need not wait.
+        """
+        return self.tip()
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Make ``commit``, a descendant of ``expected``, the tip, durably, and return true.
+
+        If the current tip is not ``expected``, or another writer holds the lock of main, change
+        nothing and return false. After Unavailable, nobody knows whether the remote got the commit,
+        so look for it before you publish it again. After PushDenied, it is not published.
+        """
+        if self.tip() != expected:
+            return False
+        if needs_push(self.objects.path):
+            raise Unavailable(
+                f"{self.address} got hooks or settings that only `git push` obeys; start again to "
+                "use it"
+            )
+        # libgit2 moves a branch only from where this reading has found it
+        reference = self.objects.references[MAIN]
+        if reference.target != expected:
+            return False
+        try:
+            with self.new.packed(commit):
+                reference.set_target(commit, "demandops")
+        except (pygit2.GitError, OSError) as error:
+            reason = disk_error(error, self.address)
+            if isinstance(reason, PushDenied) and self.tip() != expected:
+                return False  # even if the new tip is ``commit``: it may not be synced
+            if reason is not None:
+                raise reason from None
+            self._break_stale_lock()
+            if self._lock_seen is None and self.tip() == expected:
+                raise Unavailable(f"{self.address} cannot be written: {error}") from None
+            return False  # another writer holds the lock or was first; the caller tries again
+        return True
+
+    def write_anew(self, since: str) -> None:
+        """Write the commits after ``since`` again, so that they are durable."""
+        branch = Path(self.objects.path) / MAIN
+        lock = branch.with_name(f"{branch.name}.lock")
+        try:
+            self.new.read_again(self.tip(), since)
+            with self.new.packed(self.tip()), lock.open("x") as file:
+                file.write(f"{self.tip()}\n")
+                file.flush()
+                os.fsync(file.fileno())
+                lock.replace(branch)
+                sync_folder(branch.parent)
+        except (pygit2.GitError, OSError) as error:
+            self._break_stale_lock()
+            reason = disk_error(error, self.address)
+            # PushDenied would be wrong, because the commits are on main
+            if not isinstance(reason, Unsound | Unavailable):
+                reason = Unavailable(str(reason or f"{self.address} cannot be written: {error}"))
+            raise reason from None
+
+    def _break_stale_lock(self) -> None:
+        # its age counts from when this process first saw it, by the monotonic clock
+        lock = Path(self.objects.path) / f"{MAIN}.lock"
+        try:
+            status = lock.lstat()
+        except FileNotFoundError:
+            self._lock_seen = None
+            return
+        identity, now = (status.st_ino, status.st_mtime_ns), self.runtime.monotonic()
+        if self._lock_seen is None or self._lock_seen[0] != identity:
+            self._lock_seen = (identity, now)
+        elif now - self._lock_seen[1] > _STALE_LOCK_S:
+            log.warning("removing %s, which a killed process left behind", lock)
+            try:
+                lock.unlink()
+            except OSError as error:
+                raise Unavailable(
+                    f"{self.address} cannot be written: {lock} cannot be removed "
+                    f"({error.strerror}); remove it"
+                ) from None
 
     def list_references(self, *patterns: str) -> dict[str, str]:
         # name → commit; the patterns are those of ``git ls-remote``
@@ -190,26 +345,6 @@ class StateRepository(ABC):
         # another process may delete a branch meanwhile, so a name may have no reference
         pairs = ((name, repo.references.get(name)) for name in names)
         return {name: str(reference.target) for name, reference in pairs if reference is not None}
-
-    @abstractmethod
-    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        """Fetch and return the newest published commit.
-
-        If ``urgent`` returns true before the fetch ends, git is ended and FetchInterrupted is
-        raised, so that a demand need not wait.
-        """
-
-    @abstractmethod
-    def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Make ``commit``, a descendant of ``expected``, the tip, durably, and return true.
-
-        If the current tip is not ``expected``, or another writer holds the lock of main, change
-        nothing and return false. After Unavailable, nobody knows whether the remote got the commit,
-        so look for it before you publish it again. After PushDenied, it is not published.
-        """
-
-    def write_anew(self, since: str) -> None:  # noqa: B027 - a remote confirms what it stored
-        """Write the commits after ``since`` again, so that they are durable."""
 
     def reopened(self) -> Repository:
         # two threads must not use one Repository; this one has no objects that are only in memory
@@ -247,7 +382,7 @@ class StateRepository(ABC):
         """Let git check a clone, and replace a damaged one; return whether it was replaced."""
         return False
 
-    def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
+    def abort(self) -> None:
         """End the running transfer with a remote, if any; later ones raise RemoteAway."""
 
     def tidy(self) -> None:
@@ -270,3 +405,39 @@ class StateRepository(ABC):
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # so that Ctrl-C does not end it
         )
+
+
+# ---- what is only read: a person's checkout, and the last fetch of a URL ----
+
+
+class Checkout(StateRepository):
+    """A checkout: its tip is the commit that is checked out, on any branch."""
+
+    main_reference = "HEAD"
+    branches = "refs/remotes/origin/"
+
+    def tip(self) -> Oid:
+        target = self.objects.head.target
+        assert isinstance(target, Oid)  # noqa: S101 - HEAD is resolved
+        return target
+
+    def _require_usable(self, path: Path) -> None:
+        if self.objects.is_empty or self.objects.head_is_unborn:
+            raise StateRepoError(f"{path} has no commit yet; commit its files first")
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        # a person may be editing the files, and would commit back what a demand has changed
+        raise PushDenied(
+            f"{self.address} is a checkout, and no command writes to a checkout; name the "
+            "checkout's remote instead"
+        )
+
+
+class LastFetch(StateRepository):
+    """The clone of a URL at its last fetch, for readers that must not wait for the network."""
+
+    main_reference = f"refs/remotes/origin/{MAIN_BRANCH}"
+    branches = "refs/remotes/origin/"
+
+    def _require_usable(self, path: Path) -> None:
+        pass  # the process that made the clone has checked it

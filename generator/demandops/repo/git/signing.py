@@ -143,7 +143,21 @@ def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
             "(Debian: apt-get install openssh-client)"
         )
     for allowed, ids in lists.items():
-        states = _check_with_git(repo, allowed, ids)
+        with tempfile.NamedTemporaryFile("w", prefix="demandops-") as file:
+            file.write(allowed)
+            file.flush()
+            ran = child_processes.run_git(
+                repo.path,
+                *_CONFIG,
+                *("-c", f"gpg.ssh.allowedSignersFile={file.name}"),
+                *("log", "--no-show-signature", "--no-walk=unsorted", "--stdin"),
+                *("-z", "--format=%H %G? %GS"),
+                stdin="\n".join(ids) + "\n",
+            )
+        if ran.returncode:
+            raise StateRepoError(f"git cannot check signatures: {ran.stderr}")
+        rows = (row.split(" ", 2) for row in ran.stdout.split("\0") if row)
+        states = {id: (state, signer) for id, state, signer in rows}
         for id in ids:
             state, signer = states.get(id, ("", ""))  # %G? and %GS of git
             signature = signatures[id]
@@ -159,23 +173,3 @@ def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
                 continue
             results[id] = Check(fault=fault)
     return results
-
-
-def _check_with_git(
-    repo: Repository, allowed: str, commits: list[str]
-) -> dict[str, tuple[str, str]]:
-    with tempfile.NamedTemporaryFile("w", prefix="demandops-") as file:
-        file.write(allowed)
-        file.flush()
-        ran = child_processes.run_git(
-            repo.path,
-            *_CONFIG,
-            *("-c", f"gpg.ssh.allowedSignersFile={file.name}"),
-            *("log", "--no-show-signature", "--no-walk=unsorted", "--stdin"),
-            *("-z", "--format=%H %G? %GS"),
-            stdin="\n".join(commits) + "\n",
-        )
-    if ran.returncode:
-        raise StateRepoError(f"git cannot check signatures: {ran.stderr}")
-    rows = (row.split(" ", 2) for row in ran.stdout.split("\0") if row)
-    return {id: (state, signer) for id, state, signer in rows}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import getpass
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from functools import cache
@@ -16,6 +16,7 @@ from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
 from demandops.base.errors import StateRepoError
+from demandops.base.quoting import one_line
 from demandops.base.settings import GENERATED_ROOTS
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.ledger.claim import LEDGER_ROOT
@@ -24,9 +25,11 @@ from demandops.repo.git import child_processes, signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.tree import commit_of
 from demandops.repo.history.commit_message import (
+    APPROVED_BY,
     GENERATOR_EMAIL,
     GENERATOR_NAME,
     PROPOSAL,
+    REJECTS,
     generator_signature,
     parse,
     signature,
@@ -39,7 +42,19 @@ from demandops.repo.history.commit_message import (
 
 # Of the year 9999: datetime has no later year, but anybody may commit with one.
 _LAST_SECOND = 253402300799
+_GITHUB = ("GitHub", "noreply@github.com")
 _NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a person, or a rule in a person's place, said to a proposal."""
+
+    outcome: Literal["approved", "rejected"]
+    by: str  # empty if Git does not tell who moved main to the branch, or who deleted the branch
+    time: datetime
+    reason: str
+    commit: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +71,8 @@ class LogEntry:
     by_generator: bool = False
     # by the author's clock; for a demand's commit, the time when the demand was received
     authored: datetime | None = None
+    # of a demand that needed approval, and of the commit that rejects a proposal
+    answer: Answer | None = None
 
     def first(self, key: str) -> str:
         return next(iter(self.trailers.get(key, ())), "")
@@ -83,8 +100,9 @@ def entry_of(commit: Commit) -> LogEntry:
     text = parse(_text(commit.raw_message))
     committer = _text(commit.committer.raw_name), _text(commit.committer.raw_email)
     is_ours, is_proposal = committer == (GENERATOR_NAME, GENERATOR_EMAIL), PROPOSAL in text.trailers
-    # a person's message has no trailers for programs, unless it keeps those of a merged proposal
-    is_told = is_ours or is_proposal
+    # a person's message has no trailers for programs, unless it keeps those of a merged proposal,
+    # or rejects one
+    is_told = is_ours or is_proposal or REJECTS in text.trailers
     return LogEntry(
         commit=str(commit.id),
         time=time_of(commit),
@@ -95,6 +113,42 @@ def entry_of(commit: Commit) -> LogEntry:
         by_generator=is_ours and not is_proposal and "Render-Version" in text.trailers,
         authored=_time(commit.author.time),
     )
+
+
+def merges(repo: Repository, tip: str | Oid) -> dict[str, Commit]:
+    """Return for each commit that a merge brought to the history of ``tip`` that merge."""
+    merged: dict[str, Commit] = {}
+    for commit in repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL):
+        for side in commit.parent_ids[1:]:
+            brought = repo.walk(side)
+            brought.hide(commit.parent_ids[0])
+            # an older merge goes before a later one that brings all of main to somebody's branch
+            merged.update((str(each.id), commit) for each in brought)
+    return merged
+
+
+def answered(repo: Repository, entry: LogEntry, tip: Oid, merged: Mapping[str, Commit]) -> LogEntry:
+    """Return ``entry`` with who approved or rejected it; ``merged`` is :func:`merges` of main."""
+    by, reason, time, commit = entry.author, "", entry.time, entry.commit
+    if REJECTS in entry.trailers:
+        by, reason = "" if entry.by_generator else by, entry.first("Reason")
+        return replace(entry, answer=Answer("rejected", by, time, reason, commit))
+    if PROPOSAL not in entry.trailers:
+        by = ", ".join(entry.trailers.get(APPROVED_BY, ()))
+        return replace(entry, answer=Answer("approved", by, time, "", commit)) if by else entry
+    made = commit_of(repo, commit)
+    if merge := merged.get(commit):
+        by, time, commit = _raw_author(merge)[0], time_of(merge), str(merge.id)
+        # forges repeat the title of the pull request there
+        told = _text(merge.raw_message).split("\n\n")[1:2]
+        reason = "".join(told).strip() if told != [entry.summary] else ""
+    elif tip != made.id and not repo.descendant_of(tip, made.id):
+        return entry  # it is on no branch but its own
+    else:
+        committer = _text(made.committer.raw_name), _text(made.committer.raw_email)
+        by = "" if committer == (GENERATOR_NAME, GENERATOR_EMAIL) else committer[0]
+        by = entry.author if committer == _GITHUB else by  # it squashes and rebases for a person
+    return replace(entry, answer=Answer("approved", by, time, one_line(reason), commit))
 
 
 def is_by_generator(repo: Repository, commit: Commit) -> bool:
@@ -203,6 +257,13 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
             for operation in entry.trailers.get(key, ()):
                 outcomes[operation] = RecordedOutcome(entry.commit, "waiting" if waits else outcome)
     return outcomes
+
+
+def rejections_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, LogEntry]:
+    """Return the commits after ``base`` that reject a proposal, by the proposal's branch."""
+    known = base if base and base in repo else None
+    entries = (entry for _, entry in commits(repo, tip, known) if REJECTS in entry.trailers)
+    return {entry.first(REJECTS).partition(" ")[0]: entry for entry in entries}
 
 
 @dataclass(frozen=True, slots=True)

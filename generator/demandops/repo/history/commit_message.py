@@ -88,6 +88,8 @@ PROPOSAL = "Proposal"
 # The trailer with the branch and commit where the demand was proposed with other content.
 REPLACES = "Replaces"
 REQUIRED_BY = "Approval-Required-By"  # the trailer, repeated, with what requires the approval
+APPROVED_BY = "Approved-By"  # the trailer, repeated, with a rule that lets do without a person
+REJECTS = "Rejects"  # the trailer with the branch and commit of the proposal that is rejected
 
 # The committer of every commit by a generator.
 GENERATOR_NAME = "DemandOps generator"
@@ -175,6 +177,7 @@ def of_decision(
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
         *(("Connection", s.id) for s in subjects if s.kind is SubjectKind.CONNECTION),
         ("Request-Id", request.id),
+        *((APPROVED_BY, rule) for rule in decision.approved_by),
         *override_trailers(decision.overrides, keys),
         ("Render-Version", str(RENDER_VERSION)),
     ]
@@ -300,6 +303,18 @@ def of_follow(
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return compose(paragraphs, trailers)
+
+
+def rejection_trailers(
+    branch: str, commit: str, demands: Iterable[str], requesters: Iterable[str], reason: str
+) -> list[tuple[str, str]]:
+    return [
+        ("Operation", "reject"),
+        (REJECTS, f"{branch} {commit}"),
+        *(("Demand-Id", demand) for demand in demands),
+        *(("Requester", requester) for requester in requesters),
+        ("Reason", reason),
+    ]
 
 
 def of_override_end(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 
 from pygit2 import Oid, Repository, Tree
 
@@ -20,19 +19,7 @@ from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log, commit_message
 
 
-@dataclass(frozen=True, slots=True)
-class ClaimFiles:
-    claims: tuple[Claim, ...]
-    faults: tuple[Fault, ...]
-
-    def ledger(self) -> Ledger:
-        ledger = Ledger()
-        for claim in self.claims:
-            ledger = ledger.replace(claim.key, claim)
-        return ledger
-
-
-def read_claims(files: Iterable[tuple[str, str]]) -> ClaimFiles:
+def read_claims(files: Iterable[tuple[str, str]]) -> tuple[list[Claim], list[Fault]]:
     claims, faults = list[Claim](), list[Fault]()
     for path, text in files:
         if claim_files.kind_of(path) is None:
@@ -41,7 +28,7 @@ def read_claims(files: Iterable[tuple[str, str]]) -> ClaimFiles:
             claims.append(claim_files.read(text, path))
         except InvalidInput as error:
             faults += error.faults
-    return ClaimFiles(tuple(claims), tuple(faults))
+    return claims, faults
 
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
@@ -112,13 +99,14 @@ def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
 
 def restoration(repo: Repository, rollback: Rollback) -> Restoration:
     commit = trees.commit_of(repo, rollback.to)
-    files = read_claims(trees.texts(commit.tree, (claim_files.LEDGER_ROOT,)).items())
-    if files.faults:
-        raise InvalidInput(files.faults)
+    texts = trees.texts(commit.tree, (claim_files.LEDGER_ROOT,))
+    claims, faults = read_claims(texts.items())
+    if faults:
+        raise InvalidInput(faults)
     return Restoration(
         to=str(commit.id),
         made=commit_log.time_of(commit),
-        claims=files.claims,
+        claims=tuple(claims),
         drop_newer=rollback.drop_newer,
         reason=rollback.reason,
         by=rollback.by,

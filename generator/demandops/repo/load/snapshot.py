@@ -18,7 +18,7 @@ from datetime import datetime
 from types import MappingProxyType
 from typing import NamedTuple
 
-from pygit2 import Blob, Commit, Oid, Repository, Tree
+from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, OverLimit, StateRepoError, fault
@@ -139,9 +139,13 @@ def ledger_at(
     # the second version put no claim back, and named those that were not in effect
     held_back = entry.trailers.get("Held-Back", ()) if entry else ()
     ledger = Ledger()
-    for path, text in _claim_texts(commit.tree, progress):
+    files = trees.blobs(commit.tree, (claim_files.LEDGER_ROOT,))
+    blobs = [(path, blob) for path, blob in files if claim_files.kind_of(path)]
+    for done, (path, blob) in enumerate(blobs):
+        if done % 200 == 0:
+            progress(done, len(blobs))
         try:
-            claim: Claim | None = claim_files.read(text, path)
+            claim: Claim | None = claim_files.read(trees.text_of(blob), path)
             if path in held_back:
                 raise InvalidInput([fault("", "no demand could have booked this").within(path)])
         except InvalidInput as error:
@@ -149,22 +153,9 @@ def ledger_at(
             put_back[path] = claim = ledger_files.as_last_written(repo, commit.id, path)
         if claim is not None:
             ledger = ledger.replace(claim.key, claim)
+    progress(len(blobs), len(blobs))
     ended = records.read_ended_override(end_markers_at(commit.tree))
     return replace(ledger, ended=ended, waiting=_waiting(commit.tree)), put_back, faults
-
-
-def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
-    # ``progress`` gets the numbers of read and of all claim files
-    blobs: list[tuple[str, Blob]] = [
-        (path, blob)
-        for path, blob in trees.blobs(tree, (claim_files.LEDGER_ROOT,))
-        if claim_files.kind_of(path)
-    ]
-    for done, (path, blob) in enumerate(blobs):
-        if done % 200 == 0:
-            progress(done, len(blobs))
-        yield path, trees.text_of(blob)
-    progress(len(blobs), len(blobs))
 
 
 def _waiting(tree: Tree) -> records.WaitingDemands:
@@ -537,11 +528,7 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
         **carried.files,
     }
     snapshot = replace(
-        wanted,
-        state=state,
-        put_back=put_back,
-        claim_faults=tuple(faults),
-        is_rendered=True,
+        wanted, state=state, put_back=put_back, claim_faults=tuple(faults), is_rendered=True
     )
     named = (*keys, *(claim.key for claim in put_back.values() if claim))
     return Followed(snapshot, before, replace(carried, files=files), named)

@@ -223,7 +223,20 @@ def _written_tree(folder: Path, repo: Repository, scratch: Path) -> Tree:
     (tree,) = git("write-tree", "--missing-ok")
     entries = git("ls-tree", "-r", "-l", "-z", tree.decode(), *ROOTS)
     listed = [entry.partition(b"\t") for entry in entries]
-    _refuse({path: _why_not_read(about, path) for about, _, path in listed})
+
+    def why_not_read(about: bytes, path: bytes) -> str:
+        mode, _, _, size = about.split()
+        if mode == b"120000":  # it may point to a file that the report must not show
+            return "is a symbolic link, which is not followed; replace it by a file"
+        if mode == b"160000":
+            return _NESTED
+        if path.count(b"/") > trees.MAX_DEPTH:
+            return f"is more than {trees.MAX_DEPTH} folders deep; move it up"
+        return (
+            f"has more than {_LARGEST >> 20} MiB; make it smaller" if int(size) > _LARGEST else ""
+        )
+
+    _refuse({path: why_not_read(about, path) for about, _, path in listed})
     if sum(int(about.split()[3]) for about, _, _ in listed) > _MOST:
         raise StateRepoError(f"{folder} has more than {_MOST >> 20} MiB to check; take files out")
     repo.odb.add_disk_alternate(str(objects))
@@ -237,17 +250,6 @@ def _refuse(reasons: Mapping[bytes, str]) -> None:
     faults = [fault("", why).within(trees.printable(path)) for path, why in reasons.items() if why]
     if faults:
         raise InvalidInput(faults)
-
-
-def _why_not_read(about: bytes, path: bytes) -> str:
-    mode, _, _, size = about.split()
-    if mode == b"120000":  # it may point to a file that the report must not show
-        return "is a symbolic link, which is not followed; replace it by a file"
-    if mode == b"160000":
-        return _NESTED
-    if path.count(b"/") > trees.MAX_DEPTH:
-        return f"is more than {trees.MAX_DEPTH} folders deep; move it up"
-    return f"has more than {_LARGEST >> 20} MiB; make it smaller" if int(size) > _LARGEST else ""
 
 
 # ---- the commit that an edit started from ----

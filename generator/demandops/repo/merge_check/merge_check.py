@@ -9,6 +9,7 @@ shows how the merge would change desired state and bookkeeping.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import chain, count
@@ -31,7 +32,7 @@ from demandops.model.config.override import OVERRIDES_ROOT, format_time
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
-from demandops.model.ledger.ledger import Ledger, World, changes_on
+from demandops.model.ledger.ledger import Ledger, World, changes_on, ledger_of
 from demandops.render.gitops import BOOTSTRAP_ROOT, path_of
 from demandops.repo.git import tree as trees
 from demandops.repo.load import ledger_files
@@ -90,8 +91,7 @@ def check(
     except InvalidInput as error:  # of what is no plain file
         return CheckResult(error.faults)
     edit = _Edit(files, start, now or REAL.now())
-    claims = ledger_files.read_claims(sorted(files.items()))
-    faults = list(claims.faults)
+    claims, faults = ledger_files.read_claims(sorted(files.items()))
     edited = [path for path in edit.changed if _is_written_by_generator(path)]
     result = CheckResult(
         (),
@@ -103,7 +103,7 @@ def check(
     try:
         config = edit.config()
         faults += edit.unversioned_charts(config)
-        state = edit.merged_state(config, claims.ledger())
+        state = edit.merged_state(config, ledger_of(claims))
         faults += edit.refused_claims(state)
         wanted = edit.rendered(state)
     except InvalidInput as error:
@@ -130,15 +130,22 @@ def check(
         # a topic that was lacking before is not of this edit
         old = missing_inputs(start.state) if start and start.state else ()
         lacking = {(topic.application, topic.reason) for topic in old}
+        booked: tuple[EntryChange, ...] | None = ()
+        if start is not None:
+            booked = None
+            with suppress(InvalidInput):  # the base's bookkeeping may not be known
+                if start.state is not None:
+                    booked = bookkeeping_changes(bookkeeping(start.state), bookkeeping(state))
         result = replace(
             result,
             preview=preview,
             charts=charts,
-            bookkeeping=_bookkeeping_changes(start, state),
+            bookkeeping=booked,
             warnings=(
                 *(fault("", text).within(path) for path, text in idle),
                 *warnings.ignored_field_warnings(state.config),
                 *warnings.truth_warnings(files),
+                *warnings.request_warnings(state.config),
                 *warnings.policy_warnings(state),
                 *warnings.unmatched_pattern_warnings(state.config),
                 *warnings.tied_override_warnings(new.values()),
@@ -290,13 +297,10 @@ class _Edit:
             if was != theirs and self.files.get(path) == was:
                 merged.pop(path, None)
                 merged |= {path: theirs} if theirs is not None else {}
-        whole, claims = (
-            replace(self, files=merged),
-            ledger_files.read_claims(sorted(merged.items())),
-        )
-        faults = list(claims.faults)
+        whole = replace(self, files=merged)
+        claims, faults = ledger_files.read_claims(sorted(merged.items()))
         try:
-            whole.rendered(whole.merged_state(whole.config(), claims.ledger()))
+            whole.rendered(whole.merged_state(whole.config(), ledger_of(claims)))
         except InvalidInput as error:
             faults += error.faults
         for each in faults:
@@ -394,15 +398,3 @@ class _Edit:
                     f"at charts.{name} in {config.file_of(CHARTS_FILE, name)}, or no cluster "
                     "applies the change",
                 ).within(metadata)
-
-
-def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
-    if start is None:
-        return ()
-    if start.state is None:
-        return None
-    try:
-        old = bookkeeping(start.state)
-    except InvalidInput:
-        return None
-    return bookkeeping_changes(old, bookkeeping(state))

@@ -90,11 +90,7 @@ class CommitBatch:
                 new = self._repository.new
                 tree = new.add_tree(self._tree, files)
                 commit = new.add_commit(
-                    self._repository.signer,
-                    (author, committer),
-                    text,
-                    tree,
-                    [self.head.commit],
+                    self._repository.signer, (author, committer), text, tree, [self.head.commit]
                 )
                 self._tree = trees.commit_of(self._objects, commit).tree
                 break

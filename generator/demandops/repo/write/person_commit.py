@@ -6,7 +6,7 @@ The person is author and committer, so a generator reads the commit like any oth
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 
 from pygit2 import Blob, Commit, Oid, Tree
@@ -38,9 +38,12 @@ class CommitDetails:
     now: datetime
     summary: str
     reason: str = ""
+    trailers: tuple[tuple[str, str], ...] = ()  # for programs; the reason may be one of them
 
     @property
     def text(self) -> str:
+        if self.trailers:
+            return compose([[self.summary]], self.trailers)
         # the person's reason is as written: it may close an issue
         return compose([[self.summary]], []) + (
             f"\n{one_line(self.reason)}\n" if self.reason else ""
@@ -74,6 +77,32 @@ def commit_to_branch(
     return Published(str(commit), branch, link)
 
 
+def reject(
+    repository: StateRepository, proposal: PendingProposal, details: CommitDetails
+) -> Published:
+    """Record on main, in a commit without files, that a person rejects a proposal."""
+    trailers = commit_message.rejection_trailers(
+        proposal.branch, proposal.commit, proposal.demands, proposal.requesters, details.reason
+    )
+    details = replace(details, trailers=tuple(trailers))
+
+    def make(tip: Commit) -> tuple[Files, list[Oid]]:
+        _require_unmoved(repository, proposal)
+        return {}, [tip.id]
+
+    return _publish(repository, make, details)
+
+
+def _require_unmoved(repository: StateRepository, proposal: PendingProposal) -> None:
+    # If the branch moves only after this, its commit is answered all the same: a demand that was
+    # changed waits on another branch.
+    if ProposalBranches(repository).heads().branches.get(proposal.branch) != proposal.commit:
+        raise StateRepoError(
+            f"{proposal.branch} is no longer at commit {proposal.commit}, so nothing was changed; "
+            "look at the proposals again"
+        )
+
+
 def merge(
     repository: StateRepository, proposal: PendingProposal, details: CommitDetails
 ) -> Published:
@@ -82,13 +111,7 @@ def merge(
     head = trees.commit_of(objects, proposal.commit)
 
     def make(tip: Commit) -> tuple[Files, list[Oid]]:
-        # If the branch moves only after this, its commit is merged all the same: a demand that was
-        # changed waits on another branch.
-        if ProposalBranches(repository).heads().branches.get(proposal.branch) != proposal.commit:
-            raise StateRepoError(
-                f"{proposal.branch} is no longer at commit {proposal.commit}, so nothing was "
-                "merged; look at the proposals again"
-            )
+        _require_unmoved(repository, proposal)
         base = objects.merge_base(tip.id, head.id)
         if base is None:
             raise StateRepoError(

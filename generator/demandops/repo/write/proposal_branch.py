@@ -1,9 +1,10 @@
-"""Proposals in the state repo: branches ``demand/…`` that a person merges to approve the demands.
+"""Proposals in the state repo: branches that a person merges to approve what they change.
 
-The generator rebuilds a branch if newer commits on main make the branch outdated, and deletes the
-branch in the end. If a person added commits to the branch, the generator neither rebuilds it nor
-deletes it after a merge. This module knows nothing of forges except GitLab's push options and the
-link that GitLab prints.
+On ``demand/…`` the generator proposes demands that need approval; on the others people propose
+what commands would else commit to main. The generator rebuilds its branch if newer commits on main
+make the branch outdated, and deletes the branch in the end. If a person added commits to it, the
+generator neither rebuilds it nor deletes it after a merge. This module knows nothing of forges
+except GitLab's push options and the link that GitLab prints.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ from demandops.repo.load import ledger_files
 log = logging.getLogger("demandops")
 
 PREFIX = "demand/"
+# where people propose; a command that proposes something else adds its folder here
+OF_PEOPLE = ("override/", "drain/", "change/")
+_PREFIXES = (PREFIX, *OF_PEOPLE)
 _HEADS = "refs/heads/"
 _NO_OPTIONS = re.compile(r"^fatal: the receiving end does not support push options", re.MULTILINE)
 _LINK = re.compile(r"https?://\S+")
@@ -59,7 +63,8 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        commits = self._repository.list_references(MAIN, f"{_HEADS}{PREFIX}*")
+        patterns = (f"{_HEADS}{prefix}*" for prefix in _PREFIXES)
+        commits = self._repository.list_references(MAIN, *patterns)
         heads = {name.removeprefix(_HEADS): commit for name, commit in commits.items()}
         return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
 
@@ -142,9 +147,10 @@ class ProposalBranches:
 
         The proposal is ``commit``, made on ``base``. The demands would now change ``files``.
         """
-        if (compared := self._trees(tip, commit, base, files)) is None:
+        try:
+            old, proposal, now, new = self._trees(tip, commit, base, files)
+        except StateRepoError:
             return False
-        old, proposal, now, new = compared
         proposed = dict(trees.differences(old, proposal))
         if proposed != dict(trees.differences(now, new)):
             return False
@@ -154,22 +160,20 @@ class ProposalBranches:
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> bool:
         # leases aside; also true if the proposal is unknown
-        if (compared := self._trees(tip, commit, base, files)) is None:
+        try:
+            old, proposal, now, new = self._trees(tip, commit, base, files)
+        except StateRepoError:
             return True
-        old, proposal, now, new = compared
         paths = {*ledger_files.changed_files(old, proposal), *ledger_files.changed_files(now, new)}
         pairs = (map(ledger_files.valid_claim_at, (proposal, new), (path,) * 2) for path in paths)
         return all((a and a.booked) == (b and b.booked) for a, b in pairs)
 
     def _trees(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
-    ) -> tuple[Tree, Tree, Tree, Tree] | None:
+    ) -> tuple[Tree, Tree, Tree, Tree]:
+        # StateRepoError is raised if the clone was made again, or `git gc` removed the commit
         objects = self._repository.objects
-        try:
-            old, proposal = commit_of(objects, base).tree, commit_of(objects, commit).tree
-        except StateRepoError:
-            return None  # the clone was made again, or `git gc` removed the commit
-        now = commit_of(objects, tip).tree
+        old, proposal, now = (commit_of(objects, each).tree for each in (base, commit, tip))
         return old, proposal, now, objects[self._repository.new.add_tree(now, files)].peel(Tree)
 
 
@@ -177,6 +181,7 @@ class ProposalBranches:
 class PendingProposal:
     branch: str
     commit: str  # the newest of the branch, perhaps by a person
+    author: str
     summary: str
     since: datetime  # when the first demand was received
     requesters: tuple[str, ...]
@@ -199,23 +204,27 @@ class PendingProposal:
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     # those whose commits are not on main, sorted by branch
     if isinstance(repository, RemoteRepository):
-        repository.fetch_branches(PREFIX)
-    space = f"{repository.branches}{PREFIX}"
+        repository.fetch_branches(*_PREFIXES)
+    space = repository.branches
     repo = Repository(repository.objects.path)
-    main = repository.tip()
-    for name in sorted(name for name in repo.references if name.startswith(space)):
+    main, folders = repository.tip(), tuple(f"{space}{prefix}" for prefix in _PREFIXES)
+    for name in sorted(name for name in repo.references if name.startswith(folders)):
         try:
             head = repo.references[name].resolve().target
             commits = list(commit_log.commits(repo, head, main))
         except (KeyError, ValueError, TypeError, GitError, StateRepoError):
             _warn_of_unreadable(name)
             continue
-        entries = [entry for _, entry in commits if commit_message.PROPOSAL in entry.trailers]
+        branch = name.removeprefix(space)
+        entries = [entry for _, entry in commits]
+        if branch.startswith(PREFIX):
+            entries = [entry for entry in entries if commit_message.PROPOSAL in entry.trailers]
         if not entries:
             continue
         yield PendingProposal(
-            branch=f"{PREFIX}{name.removeprefix(space)}",
+            branch=branch,
             commit=str(head),
+            author=entries[0].author,
             summary=entries[0].summary,
             since=entries[-1].authored or entries[-1].time,
             requesters=_all_of(entries, "Requester"),

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
@@ -19,7 +19,7 @@ from typing import TypeAlias
 from demandops.base import errors
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, fault
 from demandops.base.quoting import quoted
-from demandops.base.settings import PROPOSAL_LIMIT
+from demandops.base.settings import PROPOSAL_LIMIT, RENDER_VERSION
 from demandops.cluster.rollouts import targets_of_decision
 from demandops.decide.decision import Decision
 from demandops.decide.state import State
@@ -94,6 +94,7 @@ class Approvals:
         self._forge = ForgeWorker(token_file, on_update, repository.runtime)
         self.proposals: dict[str, Proposal] = {}  # by branch
         self._changed: deque[str] = deque()
+        self._unrecorded: list[tuple[Proposal, str]] = []  # rejected, and why
         for ticket in demands.proposed:  # of an earlier run
             request = admit_or_none(state, ticket.demand)
             record = replace(ticket.proposal or ProposalRecord(""), withdrawn="")
@@ -207,7 +208,9 @@ class Approvals:
         tickets = (ticket for proposal in self.proposals.values() for ticket in proposal.tickets)
         return bool(self._changed) or any(ticket.state == "withdrawn" for ticket in tickets)
 
-    def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
+    def check(
+        self, snapshot: Snapshot, heads: BranchHeads, publish: Callable[[CommitBatch], bool]
+    ) -> None:
         # It answers the demands that are decided or withdrawn, and updates the other proposals.
         # ``snapshot`` is of main, at ``heads.main`` or later. After an error, the next one goes on.
         while self._changed:
@@ -246,8 +249,40 @@ class Approvals:
                     self._demands.fail(proposal.tickets, error)
                     self._forget(proposal, str(error))
 
+        self._record_rejections(snapshot, publish)
+
+    def _record_rejections(
+        self, snapshot: Snapshot, publish: Callable[[CommitBatch], bool]
+    ) -> None:
+        # A person who deletes a branch or closes a pull request leaves nothing in the history. So
+        # the generator commits that, as `reject` does, and answers when the next check reads it.
+        if not self._unrecorded:
+            return
+        commits, now = CommitBatch(self._repository, snapshot), self._runtime.now()
+        while self._unrecorded:
+            proposal, reason = self._unrecorded.pop()
+            self._changed.append(proposal.branch)
+            demands = dict.fromkeys(each.demand or each.id for each in proposal.requests)
+            trailers = [
+                *commit_message.rejection_trailers(
+                    proposal.branch,
+                    proposal.record.commits[-1],
+                    [each.demand for each in proposal.requests],
+                    sorted(proposal.requesters()),
+                    reason,
+                ),
+                *commits.head.trailers,
+                ("Render-Version", str(RENDER_VERSION)),
+            ]
+            text = commit_message.compose([[f"Reject {', '.join(demands)}: {reason}"]], trailers)
+            author = commit_message.generator_signature(now)
+            commits.commit_files({}, commits.head.state, text, author, now)
+        if not publish(commits):
+            log.info("another writer was first; recording the rejections again")
+
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
         objects, tip = self._repository.objects, str(snapshot.commit)
+        rejections = commit_log.rejections_since(objects, tip, proposal.searched_to)
         on_main = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
         head, added = heads.branches.get(proposal.branch, ""), set[ClaimKey]()
         if head and not proposal.record.commits:
@@ -257,10 +292,16 @@ class Approvals:
         # a person who edited or deleted the branch may have merged it without our operation ids
         if proposal.record.pushed and head not in proposal.record.commits:
             added = ledger_files.added_by_people(objects, proposal.searched_to, snapshot.commit)
-        proposal.searched_to = tip
         read = CommitBatch(self._repository, snapshot).read
         pull_request = self._forge.pull_request(proposal.branch)
-        verdict = proposal.verdict(snapshot.state, read, on_main, added, head, pull_request)
+        rejection = rejections.get(proposal.branch)
+        verdict = proposal.verdict(
+            snapshot.state, read, on_main, added, head, pull_request, rejection
+        )
+        if verdict.unrecorded:
+            self._unrecorded.append((proposal, verdict.unrecorded))
+            return
+        proposal.searched_to = tip
         booked = [
             (ticket, self._receipt(ticket, decision, snapshot, on_main.get(ticket.operation)))
             for ticket, decision in verdict.booked

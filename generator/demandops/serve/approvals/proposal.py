@@ -24,6 +24,7 @@ from demandops.model.demand.demand import Demand
 from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.forge import PullRequest
 from demandops.repo.history import commit_message
+from demandops.repo.history.commit_log import LogEntry
 from demandops.serve.journal import ProposalRecord, Ticket
 
 Decided: TypeAlias = list[tuple[Ticket, Decision]]
@@ -32,7 +33,7 @@ Failed: TypeAlias = list[tuple[Ticket, DemandOpsError]]
 _PREFIX = "awaiting approval: "
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Verdict:
     # Main has the claims of these, with the decision that each would get on the current main.
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
@@ -40,6 +41,8 @@ class Verdict:
     failed: Failed = field(default_factory=list)
     free: list[Ticket] = field(default_factory=list)  # these no longer need approval
     unapproved: Decided = field(default_factory=list)
+    # Why these are turned down, if main does not have it yet: then it must be recorded first.
+    unrecorded: str = ""
 
 
 @dataclass(eq=False)
@@ -74,10 +77,12 @@ class Proposal:
         added: Container[ClaimKey],
         head: str,
         pull_request: PullRequest | None,
+        rejection: LogEntry | None,
     ) -> Verdict:
         # ``on_main`` has the operation ids in the commits of main since ``searched_to``. ``added``
         # has the claims that people added since then, if a person edited or deleted the branch.
-        # ``head`` is empty if the branch does not exist.
+        # ``head`` is empty if the branch does not exist. ``rejection`` is the commit of main that
+        # rejects the proposal.
         verdict = Verdict()
         for ticket in self.tickets:
             decision: Decision | InvalidInput
@@ -102,15 +107,19 @@ class Proposal:
                 verdict.unapproved.append((ticket, decision))
             else:
                 verdict.free.append(ticket)
-        why_not = ""
-        if self.record.pushed and not head:
-            why_not = f"was turned down: {self.branch} is gone and was not merged"
-        elif pull_request is not None and pull_request.state == "closed":
-            why_not = f"was turned down: {pull_request.link} was closed"
         # a branch is gone after a merge too, but then its demands are booked
-        if why_not and not verdict.booked:
-            verdict.failed.extend((ticket, TurnedDown(why_not)) for ticket, _ in verdict.unapproved)
+        if verdict.booked or not verdict.unapproved:
+            return verdict
+        if rejection is not None:
+            by = "" if rejection.by_generator else f" by {rejection.author}"
+            reason = f": {why}" if (why := rejection.first("Reason")) else ""
+            why_not = TurnedDown(f"was turned down{by}{reason} (commit {rejection.commit[:10]})")
+            verdict.failed.extend((ticket, why_not) for ticket, _ in verdict.unapproved)
             verdict.unapproved.clear()
+        elif self.record.pushed and not head:
+            verdict.unrecorded = f"{self.branch} was deleted and not merged"
+        elif pull_request is not None and pull_request.state == "closed":
+            verdict.unrecorded = f"{pull_request.link} was closed and not merged"
         return verdict
 
     def drop(self, answered: Iterable[tuple[Ticket, object]]) -> None:
