@@ -6,8 +6,7 @@ check what the policy allows (:mod:`.permission`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 from itertools import chain
 
 from demandops.base.errors import Fault, fault, suggestion
@@ -18,7 +17,6 @@ from demandops.connections import connection_types
 from demandops.connections.connection import Connection
 from demandops.model.config.appdef import ApplicationDefinition, Services
 from demandops.model.config.config import (
-    BROKERS_FILE,
     CHARTS_FILE,
     DOMAINS_FILE,
     NODES_FILE,
@@ -27,12 +25,10 @@ from demandops.model.config.config import (
 )
 from demandops.model.demand.demand import (
     LONGEST_S,
-    AnyDemand,
     Application,
     Connect,
     Delivery,
     Demand,
-    Item,
 )
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
@@ -278,31 +274,3 @@ def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
         yield from _id_faults(f"requesters[{index}]", requester)
     if not requesters:
         yield fault("requesters", "is empty; list at least one requester")
-
-
-def with_chosen_types(
-    request: AnyDemand, config: Config, current: Callable[[str], Connection | None]
-) -> AnyDemand:
-    if not request.adds_claims:
-        return request
-
-    notes, demanded = list(request.notes), list[Item]()
-    for item in request.demanded:
-        connection = item.held
-        if isinstance(connection, Connection) and connection.type is None:
-            # A claimed connection keeps its type. Else a new broker or node property would change
-            # the type that is chosen, and the request would contradict the other claims.
-            claimed = current(connection.id)
-            chosen = claimed.type if claimed else connection_types.choose_type(connection, config)
-            connection = replace(connection, type=chosen)
-        if isinstance(connection, Connection) and connection.type and connection.broker:
-            named = connection.broker
-            used = "" if id_problem(named) else connection.type.broker_node(connection, config)
-            if used not in ("", named):
-                notes.append(
-                    f"connection '{connection.id}' uses the broker on '{used}', because "
-                    f"{config.place_of(BROKERS_FILE)} has none on {quoted(named)}"
-                )
-                connection = replace(connection, broker=used)
-        demanded.append(replace(item, held=connection))
-    return replace(request, demanded=tuple(demanded), notes=tuple(notes))
