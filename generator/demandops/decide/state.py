@@ -53,16 +53,16 @@ class State(World):
         object.__setattr__(self, "_names", names)
         return names
 
-    def followed_by(self, ledger: Ledger, planned: changeset.PlannedChange, usage: Usage) -> State:
+    def followed_by(
+        self, ledger: Ledger, planned: changeset.PlannedChange, usage: Usage, names: Names
+    ) -> State:
         plans = self.plans
         for key, release in planned.plans.items():
             plans = plans.insert(key, release) if release else plans.discard(key)
         state = replace(self, ledger=ledger)
         object.__setattr__(state, "plans", plans)
         object.__setattr__(state, "_usage", usage)
-        if self._names is not None:
-            names = collisions.followed(self._names, self, state, planned.plans.keys())
-            object.__setattr__(state, "_names", names)
+        object.__setattr__(state, "_names", names)
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
