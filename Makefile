@@ -4,7 +4,7 @@ VENV   ?= .venv
 PY     := $(VENV)/bin/python
 STAMP  := $(VENV)/.setup-done
 # Each target first checks that the system provides what it needs.
-SYSTEM := system-demo system-test system-page system-faults system-e2e system-e2e-argocd
+SYSTEM := system-demo system-test system-page system-faults system-e2e system-e2e-argocd system-image
 # The Go of distributions is too old, so the end-to-end tests install this version unless PATH has
 # it or a newer one.
 GO     := 1.26
@@ -29,7 +29,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-processes test-nightly nightly test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs wheel release clean
+.PHONY: help setup demo test test-processes test-nightly nightly test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs image wheel release clean
 .PHONY: $(SYSTEM) go
 
 help:  ## List the targets
@@ -174,6 +174,10 @@ docs: setup  ## Build the documentation into build/site, check its links, run it
 	@$(PY) -m mkdocs build
 	@$(PY) -m pytest -q -n auto --dist worksteal $(DOCS_TESTS)
 	@echo "docs: open build/site/index.html"
+
+image: system-image  ## Build the image without a container engine, start the node from it and book a demand; as root, ten minutes
+	@deploy/image build/image
+	@deploy/try-image build/image
 
 wheel: setup  ## Build the wheel into dist/
 	@$(PY) -m build --wheel --outdir dist .

@@ -169,7 +169,7 @@ class TestRollback:
     @pytest.fixture
     def roll(self, on: On, played: GitRepo) -> Run:
         def back(*args: str) -> Ran:
-            return on("rollback", *args, "--output", "json")
+            return on("rollback", *args, "--yes", "--output", "json")
 
         return back
 
@@ -203,7 +203,7 @@ class TestRollback:
         git(played, "config", "user.name", "x")
         git(played, "config", "user.email", "x@example.org")
         other = git(played, "commit-tree", "-m", "other", f"{played.tip}^{{tree}}")
-        ran = on("rollback", other, "-m", "x")
+        ran = on("rollback", other, "-m", "x", "-y")
         assert ran.code == 1 and f"commit {other} is not in the history" in ran.err
 
     def test_no_request_file_rolls_back(self, on: On, played: GitRepo) -> None:

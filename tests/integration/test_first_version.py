@@ -102,7 +102,7 @@ def test_demands_of_before_are_given_up_and_restored_after_the_upgrade(
     assert not state.files("ledger/shutdowns/")
     assert on("request", EXPERIMENT / "6-vehicle01-leaves.yaml").code == 0
     assert not any("vehicle01" in file.get("requesters", ()) for file in claims(state))
-    assert on("rollback", before, "--reason", "try", "--drop-newer").code == 0
+    assert on("rollback", before, "--reason", "try", "--drop-newer", "-y").code == 0
     assert any("vehicle01" in file["requesters"] for file in claims(state))
     assert on("verify").code == 0
     assert git(state, "fsck", "--strict") == ""

@@ -93,7 +93,7 @@ def test_watch_prints_the_list_again_when_it_changes(on: On, fleet: GitRepo) -> 
         assert watching.stdout is not None
         first = json.loads(watching.stdout.readline())
         assert [item["name"] for item in first["items"]] == ["patrol"]
-        on("decommission", "vehicle00")
+        on("decommission", "vehicle00", "-y")
         second = json.loads(watching.stdout.readline())
         watching.terminate()
     assert (second["items"], second["commit"]) == ([], fleet.tip)

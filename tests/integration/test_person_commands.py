@@ -34,7 +34,7 @@ def carried_out(state: GitRepo) -> None:
 class TestOverride:
     def test_its_commit_is_in_the_persons_name(self, on: On, joined: GitRepo) -> None:
         options = ("--node", "edge", "--hold", "-m", "Measured\nwithout it")
-        ran = on("override", "create", "idle", *options)
+        ran = on("override", "create", "idle", *options, "-y")
         assert f"Create override idle: commit {joined.tip} on main" in ran.out
         assert git(joined, "log", "-1", "--format=%an <%ae>|%cn|%s|%b") == (
             "Petra Platform <petra@example.org>|Petra Platform|Create override idle|"
@@ -47,14 +47,14 @@ class TestOverride:
     ) -> None:
         for name in ("GIT_AUTHOR_NAME", "GIT_AUTHOR_EMAIL"):
             monkeypatch.delenv(name)
-        ran = on("override", "create", "calm", "--node", "edge", "--hold", "-m", "x")
+        ran = on("override", "create", "calm", "--node", "edge", "--hold", "-m", "x", "-y")
         assert ran.code == 0
         assert "warning: git does not know who you are, so the commit's author is " in ran.err
         assert 'git config --global user.name "Your Name"' in ran.err
 
 
 class TestSuspend:
-    SUSPEND = ("suspend", "--requester", "vehicle00", "-m", "Sold")
+    SUSPEND = ("suspend", "--requester", "vehicle00", "-m", "Sold", "-y")
 
     def test_suspended_demands_run_again_after_a_resume(self, on: On, joined: GitRepo) -> None:
         files = joined.manifests()
@@ -65,7 +65,7 @@ class TestSuspend:
         assert demand["state"] == "suspended"
         ran = on("request", "-", stdin=yaml.safe_dump(perception()))
         assert "suspend-vehicle00" in ran.out + ran.err
-        assert on("resume", "--requester", "vehicle00").code == 0
+        assert on("resume", "--requester", "vehicle00", "-y").code == 0
         carried_out(joined)
         assert joined.manifests() == files
 
@@ -73,15 +73,16 @@ class TestSuspend:
         self, on: On, joined: GitRepo, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(naming, "MOST_DIGITS", 1)
-        name = name_of({"requesters": ("vehicle00",)})
-        patterns = ("vehicle00" + "*" * number for number in range(100))
+        suspend = ("suspend", "--node", "vehicle00", "-m", "Sold", "-y")
+        name = name_of({"nodes": ("vehicle00",)})
+        patterns = ("vehicle00" + "*" * number for number in range(1, 100))
         rival = next(one for one in patterns if name_of({"nodes": (one,)}) == name)
-        assert on(*self.SUSPEND).code == 0
+        assert on(*suspend).code == 0
         before = joined.tip
-        assert on("suspend", "--node", rival, "-m", "Sold").code != 0
-        assert on("resume", "--node", rival).code != 0
+        assert on("suspend", "--node", rival, "-m", "Sold", "-y").code != 0
+        assert on("resume", "--node", rival, "-y").code != 0
         assert joined.tip == before
-        assert on("resume", "--requester", "vehicle00").code == 0
+        assert on("resume", "--node", "vehicle00", "-y").code == 0
 
     def test_a_lock_that_a_killed_program_left_is_told_with_the_remedy(
         self, on: On, joined: GitRepo

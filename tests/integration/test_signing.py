@@ -160,7 +160,7 @@ def test_the_commit_of_a_proposal_is_signed(
     assert git_accepts(key, branch)
     before, images = state.tip, "registry/images.yaml"
     state.commit({images: state.files()[images].replace("2025-04", "2025-05")})
-    assert on("rollback", before, "-m", "x").code == 0
+    assert on("rollback", before, "-m", "x", "-y").code == 0
     assert branches(state.path) == [branch]
 
 

@@ -146,12 +146,10 @@ def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_pa
         assert os.access(tmp_path / "lib" / "demandops_ros" / program, os.X_OK)
 
 
-SCRIPT = Path(__file__).parents[2] / "deploy" / "fresh-root"
+SCRIPT = Path(__file__).parents[2] / "deploy" / "image"
 STAND_INS = {
     "debootstrap": 'echo "$@" >"$CALLED"; mkdir -p "$3/etc/apt"',
-    "chroot": "",
-    "mount": "",
-    "umount": "",
+    "buildah": """case "$*" in *mount*) mkdir -p "$ROOT/bin"; echo "$ROOT" ;; esac""",
     "apt-get": """
 test "$1" = indextargets
 [ -e "$SOURCES" ] && cat "$SOURCES" || exit 0""",
@@ -179,8 +177,8 @@ def test_it_has_the_release_and_the_sources_of_the_machine(
         (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
         (tmp_path / name).chmod(0o755)
     environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    environment |= {"SOURCES": str(sources), "CALLED": str(called)}
-    command = ["sh", str(SCRIPT), str(root)]
+    environment |= {"SOURCES": str(sources), "CALLED": str(called), "ROOT": str(root)}
+    command = ["sh", str(SCRIPT), str(tmp_path / "image")]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if not has_sources:
         assert (done.returncode, called.exists()) == (1, False)

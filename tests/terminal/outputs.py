@@ -69,8 +69,8 @@ def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
         clock[0] += timedelta(minutes=1)
         _done(f"request {file}")
     clock[0] += timedelta(hours=1)
-    _done("suspend --requester vehicle03 -m 'In the workshop'")
-    _done("override create more --service object-detection --replicas 2 -m Load --expires 2d")
+    _done("suspend -y --requester vehicle03 -m 'In the workshop'")
+    _done("override create -y more --service object-detection --replicas 2 -m Load --expires 2d")
     policy = yaml.safe_load(repo.files()[POLICY])
     policy["domains"][0]["approval"] = "required"
     petra = ("Petra Platform", "petra@example.org", int(NOW.timestamp()) - 3600)

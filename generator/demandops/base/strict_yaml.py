@@ -316,6 +316,33 @@ def set_key(text: str, key: str, value: object) -> str:
     raise InvalidInput.at(key, message)
 
 
+def set_flag(text: str, items: str, id: str, key: str, value: bool) -> str:
+    """Return a file's text with a key of one item of a list set; the rest stays, with comments."""
+    wanted, written = load(text), f"{key}: {str(value).lower()}"
+    found = (item for item in wanted[items] if item["id"] == id)
+    next(found)[key] = value
+    root: Any = yaml.compose(text, Loader=_CLoader)
+    for item in next(each for node, each in root.value if node.value == items).value:
+        entries = {node.value: (node, each) for node, each in item.value}
+        if entries["id"][1].value != id:
+            continue
+        if key in entries:
+            start, end = entries[key][0].start_mark.index, entries[key][1].end_mark.index
+            changed = f"{text[:start]}{written}{text[end:]}"
+        elif item.flow_style:
+            end = entries["id"][1].end_mark.index
+            changed = f"{text[:end]}, {written}{text[end:]}"
+        else:
+            place, line_end = entries["id"], "\r\n" if "\r\n" in text else "\n"
+            end = text.find("\n", place[1].end_mark.index) + 1
+            line = f"{' ' * place[0].start_mark.column}{written}{line_end}"
+            changed = f"{text[:end]}{line}{text[end:]}" if end else f"{text}{line_end}{line}"
+        with suppress(InvalidInput):  # such as a key in an anchor that other items share
+            if load(changed) == wanted:
+                return changed
+    raise InvalidInput.at(items, f"cannot be changed automatically; write {written} at '{id}'")
+
+
 # Finds the digits before the `e` of a JSON number like `1e-09`. YAML 1.1 would read such a number
 # as text. The pattern matches quoted texts as a whole, so that no digits inside them are found.
 _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')

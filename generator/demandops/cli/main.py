@@ -22,12 +22,11 @@ from demandops import __version__
 from demandops.base.errors import DemandOpsError, InvalidInput, Unsound
 from demandops.base.quoting import OneLineFormatter, one_line
 from demandops.cli.output import OutputLost, done, errors, open_streams, show_slow
-from demandops.repo.git import remote_repository
 
 # The package of each command's module, and the short help, which `--help` shows without importing
 # the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.
 COMMANDS = {
-    "approve": ("changes.approve", "Approve a proposed demand: merge its branch in your own name."),
+    "approve": ("changes.approve", "Approve a proposal: merge its branch in your own name."),
     "bookkeeping": ("queries.bookkeeping", "Show who requests which service and connection."),
     "check": ("authoring.check", "Check edits of a state repo and show their consequences."),
     "completion": ("program", "Print the completion script for a shell."),
@@ -43,13 +42,17 @@ COMMANDS = {
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
     "log": ("queries.log", "List the commits of the state repo, newest first."),
-    "new": ("authoring.new", "Write a new application, override or image."),
+    "new": ("authoring.new", "Write a new application or image."),
     "override": ("changes.override", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
         "demandops_ros.parameter_sync",
         "Keep a ROS node's parameters equal to those in a ConfigMap.",
     ),
-    "reject": ("changes.approve", "Turn a proposed demand down: delete its branch."),
+    "release": (
+        "changes.ledger_change",
+        "Stop one demand, or an application for all who demand it.",
+    ),
+    "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),
     "request": ("changes.request", "Book demand requests from files."),
     "resume": ("changes.override", "Run suspended applications and connections again."),
     "rollback": (
@@ -118,6 +121,8 @@ class _LazyGroup(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         name, command, arguments = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
+            from demandops.repo.git import remote_repository  # noqa: PLC0415 - it imports pygit2
+
             remote_repository.listen(show_slow)
         return name, load(name) if name else command, arguments
 

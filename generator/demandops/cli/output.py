@@ -9,6 +9,7 @@ import io
 import os
 import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
@@ -115,10 +116,23 @@ def print_lines(lines: list[str]) -> None:
     click.echo_via_pager(text)
 
 
+def fitted(text: str, width: int | None) -> str:
+    """Return text whose lines are wrapped between words, with a deeper indent, to fit the width."""
+    lines = text.split("\n")
+    for at, line in enumerate(lines):
+        if width is not None and len(line) > width:
+            indent = " " * (len(line) - len(line.lstrip()) + 4)
+            words = textwrap.TextWrapper(width, subsequent_indent=indent, break_on_hyphens=False)
+            words.break_long_words = False
+            lines[at] = words.fill(line)
+    return "\n".join(lines)
+
+
 class _Errors:
     def print(self, text: str) -> None:
+        width = shutil.get_terminal_size().columns if sys.stderr.isatty() else None
         with suppress(OSError):  # nothing else can tell it
-            click.echo(quoting.lines(text), err=True)
+            click.echo(fitted(quoting.lines(text), width), err=True)
 
 
 errors = _Errors()

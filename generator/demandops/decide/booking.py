@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 
 from demandops.base.errors import Fault, Refused, fault, suggestion
-from demandops.base.naming import Subject, TopicKey
+from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection, Route
 from demandops.decide.admission import admission, permission
@@ -351,13 +351,16 @@ def expire(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Chan
     return after, Changes(claims=claim_changes(ledger, after, [claim.key for claim in ended]))
 
 
-def decommission(ledger: Ledger, request: Decommission) -> tuple[Ledger, Changes]:
-    """Release or reduce claims, because a node or a requester leaves for good.
+def decommission(  # noqa: PLR0912 - of four kinds
+    ledger: Ledger, request: Decommission
+) -> tuple[Ledger, Changes]:
+    """Release or reduce claims, because a person ends them.
 
     If a node is decommissioned, these are released for all requesters: the applications that run on
     the node, the inputs from it, the deliveries to it, and the connections from or to it. A
     connection that names the node's broker loses the broker. If a requester is decommissioned, all
-    its claims are released, also those that name others, who might never release them.
+    its claims are released, also those that name others, who might never release them. A demand, or
+    the claims on an application, are released for all their requesters.
     """
     start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
     nodes = request.nodes or (request.id,)
@@ -370,6 +373,15 @@ def decommission(ledger: Ledger, request: Decommission) -> tuple[Ledger, Changes
         # a waiting demand that names others too stays, because they can still release it
         demands = ledger.waiting.values()
         waiting = tuple(each.demand for each in demands if each.requesters == (request.id,))
+    whole = list[Claim]()
+    if "demand" in request.kinds:
+        whole += ledger.claims_of_demand(request.id)
+        waiting += (request.id,) * (request.id in ledger.waiting)
+    if "application" in request.kinds:
+        whole += ledger.application_claims(request.id)
+    for claim in whole:
+        if claim.keeping_override is None:  # an override keeps it as long as the override is there
+            ledger = ledger.replace(claim.key, None)
     for claim in claims.values():
         left: Claim | None = claim
         if "requester" in request.kinds and request.id in claim.requesters:
@@ -377,13 +389,17 @@ def decommission(ledger: Ledger, request: Decommission) -> tuple[Ledger, Changes
         for node in nodes:
             left = left.without_node(node) if left and left.held.needs(node) else left
         ledger = ledger.replace(claim.key, left)
-    changes = claim_changes(start, ledger, [claim.key for claim in claims.values()])
+    changes = claim_changes(start, ledger, [c.key for c in (*claims.values(), *whole)])
     if not changes and not waiting:
         names = start.indexed_names("requester") if "requester" in request.kinds else set()
         if "node" in request.kinds:
             names |= start.indexed_names("node") | start.indexed_names("link")
+        if "demand" in request.kinds:
+            names |= start.indexed_names("demand") | {*start.waiting}
+        if "application" in request.kinds:
+            names |= {*start.subjects(SubjectKind.APPLICATION)}
         kinds = " or ".join(sorted(request.kinds))
-        message = f"no claim names a {kinds} '{request.id}'{suggestion(request.id, names)}"
+        message = f"no claim names the {kinds} '{request.id}'{suggestion(request.id, names)}"
         raise Refused.at("name", message, code="not-held")
     return ledger.without_waiting(waiting), Changes(claims=changes, waiting=waiting)
 
@@ -456,8 +472,25 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
 
 
 def _restored(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
-    earlier = {claim.key: claim for claim in request.claims}
-    changes = [ClaimChange(claim, None) for claim in ledger if claim.key not in earlier]
+    now, then, app = list(ledger), list(request.claims), request.application
+    if request.demand or app:
+        of_app = {c.demand for c in (*now, *then) if c.is_on_application and c.subject.id == app}
+        demands = {request.demand} if request.demand else of_app
+        now, then = (
+            [
+                claim
+                for claim in claims
+                if claim.demand in demands
+                and (not app or not claim.is_on_application or claim.subject.id == app)
+            ]
+            for claims in (now, then)
+        )
+        if not (now or then):
+            what = f"application '{app}'" if app else f"demand '{request.demand}'"
+            message = f"no claim of {what} is here, nor was one at commit {request.to[:10]}"
+            raise Refused.at("", message, code="not-held")
+    earlier = {claim.key: claim for claim in then}
+    changes = [ClaimChange(claim, None) for claim in now if claim.key not in earlier]
     for key, claim in earlier.items():
         current = ledger.get(key)
         if current is not None:

@@ -52,8 +52,8 @@ def override_report(world: World, now: datetime) -> list[Entry]:
         changed = tuple(sorted(releases[name], key=lambda release: release.name))
         held = tuple(claims[name])
         state: State = "matches nothing"
-        if changed or held:
-            state = "in force" if held else "held back"
+        if changed or held or override.refuseNew:
+            state = "in force" if held or override.refuseNew else "held back"
             for release in changed:
                 own = next(
                     (effects for each, effects in release.shaping.by if each == override), ()

@@ -301,8 +301,6 @@ class HealthChange:
     before: str  # a word of `WORDS`, as `after` is
     after: str
     reason: str = ""
-    # For a release that became healthy: how long the page saw that it was not.
-    lasted_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

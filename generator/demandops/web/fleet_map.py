@@ -1,170 +1,121 @@
-"""The map: nodes with their services, and the connections between nodes."""
+"""The map: nodes and stacks of like nodes in rows, and the connections between them.
+
+The server places everything, so the same state gives the same picture, and it is drawn without
+scripts. A line runs only in the free space between rows and in the gaps between the cards of a row,
+so none is behind a card.
+"""
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
 from demandops.views.source import RANKS, WORDS, Source, word_of
-from demandops.web.lists import Filter, Row, rows_of
+from demandops.web.lists import Filter, Row, exactly, rows_of
 
-# ---- the layout: nodes are drawn at their positions, or by cluster and type ----
+# A drawing for wide screens and one for phones, of which the style sheet shows one: its width, the
+# widths of its large and of its small cards, the least gap between them, and above how many nodes
+# of a type these are drawn as stacks.
+_DRAWINGS = {"wide": (1200.0, 212.0, 144.0, 20.0, 40), "narrow": (340.0, 156.0, 102.0, 8.0, 12)}
+# The same for nodes that have nothing to do with what a filter finds.
+_FEW_CARDS = 4
+# Up to how many cards are large, so that they list releases by their names, and how many of these.
+_MOST_LARGE, _MOST_LISTED = 16, 5
+# Without a filter, more lines than this would say nothing; then only those not ready are drawn.
+_MOST_LINES = 150
+# By position, the map has so many columns and rows; nodes of one cell form a stack if there are
+# too many to draw each.
+_CELLS = 6
+_CHANNEL = 44.0  # the free height between two rows of cards
 
-WIDTH = 1200.0
-HEAD = 30.0
-_GAP = 14.0
-_PLACE_HEIGHT = 640.0
-_TYPES = ("cloud", "edge", "station", "vehicle")
-
-# A cluster's name, and its x, y, width and height on the map.
-Box = tuple[str, float, float, float, float]
+_TYPES = ("cloud", "edge", "station", "vehicle")  # from top to bottom, other types below
+_WORST_FIRST = ("bad", "busy", "none", "good", "empty")
 
 
 @dataclass(frozen=True, slots=True)
-class ServiceMark:
-    name: str
+class Mark:
+    """A release on the card of a node, or a node on the card of a stack."""
+
     text: str
     tone: str
+    is_service: bool
     is_lit: bool
+
+
+def _tone(marks: Iterable[Mark]) -> str:
+    return min((mark.tone for mark in marks), key=_WORST_FIRST.index, default="empty")
+
+
+@dataclass(slots=True)
+class Card:
+    nodes: list[Node]
+    is_lit: bool
+    query: str  # the filter that chooses these nodes
+    marks: list[Mark]
+    tone: str
+    x: float = 0.0
+    y: float = 0.0
+    width: float = 0.0
+    height: float = 0.0
+    row: int = 0
+    is_large: bool = False
+
+    @property
+    def is_stack(self) -> bool:
+        return len(self.nodes) > 1
+
+    @property
+    def is_drained(self) -> bool:
+        return all(node.drained for node in self.nodes)
+
+    @property
+    def middle(self) -> float:
+        return self.x + self.width / 2
+
+    @property
+    def bottom(self) -> float:
+        return self.y + self.height
+
+    @property
+    def label(self) -> str:
+        if not self.is_stack:
+            return self.nodes[0].id
+        types = {node.type for node in self.nodes}
+        return f"{len(self.nodes)} {types.pop() if len(types) == 1 else 'node'}s"
+
+    @property
+    def state(self) -> str:
+        late = sum(mark.tone in ("bad", "busy") for mark in self.marks)
+        words = [f"{late} not ready"] if late else []
+        words += [] if self.is_stack else [self.nodes[0].type]
+        words += ["drained"] if self.is_drained else []
+        words += ["unused"] if self.tone == "empty" else []
+        return ", ".join(words)
+
+    @property
+    def title(self) -> str:
+        releases = [] if self.is_stack else [f"{len(self.marks)} releases"]
+        clusters = ", ".join(sorted({node.cluster for node in self.nodes}))
+        return f"{self.label}: {', '.join([self.state, *releases, f'cluster {clusters}'])}"
+
+    def short(self, text: str) -> str:
+        most = int((self.width - 26) / 6.4)
+        return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 @dataclass(frozen=True, slots=True)
-class NodeCard:
-    id: str
-    type: str
-    x: float
-    y: float
-    width: float
-    height: float
-    tone: str
+class Link:
+    """A connection, as the map shows it."""
+
+    ends: tuple[str, ...]  # its nodes
+    name: str
+    topics: int
+    word: str  # its health
     is_lit: bool
-    is_drained: bool
-    count: int  # of all services on the node
-    label: str
-    title: str
-    services: tuple[ServiceMark, ...] = ()  # none on a small card
-    more: int = 0  # how many services the card has no room for
-
-    def curve_to(self, target: NodeCard) -> str:
-        if self.y + self.height <= target.y:  # down
-            start, end, bend = self.y + self.height, target.y, 1.0
-        elif target.y + target.height <= self.y:  # up
-            start, end, bend = self.y, target.y + target.height, -1.0
-        else:  # between cards side by side, in an arc below both
-            start, end, bend = self.y + self.height, target.y + target.height, 0.0
-        reach = max(18.0, abs(end - start) / 2)
-        first = start + (bend or 1.0) * reach
-        second = end - bend * reach if bend else end + reach
-        own, other = self.x + self.width / 2, target.x + target.width / 2
-        return (
-            f"M{own:.1f} {start:.1f}C{own:.1f} {first:.1f} "
-            f"{other:.1f} {second:.1f} {other:.1f} {end:.1f}"
-        )
-
-
-def by_cluster(
-    cards: Mapping[str, NodeCard], nodes: Sequence[Node]
-) -> tuple[dict[str, NodeCard], list[Box], float]:
-    """Return the placed cards by node id, one box for each cluster, and the height of the map."""
-    clusters: dict[str, dict[str, list[NodeCard]]] = {}
-    for node in sorted(nodes, key=lambda node: node.id):
-        clusters.setdefault(node.cluster, {}).setdefault(node.type, []).append(cards[node.id])
-    placed: dict[str, NodeCard] = {}
-    boxes: list[Box] = []
-    x = y = shelf = 0.0
-    for name, groups in sorted(clusters.items()):
-        inside, width, height = _box(groups, is_alone=len(clusters) == 1)
-        if x and x + width > WIDTH:
-            x, y, shelf = 0.0, y + shelf + _GAP, 0.0
-        boxes.append((name, x, y, width, height))
-        placed |= {card.id: replace(card, x=card.x + x, y=card.y + y) for card in inside}
-        x, shelf = x + width + _GAP, max(shelf, height)
-    return placed, boxes, y + shelf
-
-
-def _box(
-    groups: Mapping[str, list[NodeCard]], *, is_alone: bool
-) -> tuple[list[NodeCard], float, float]:
-    """Return a cluster's cards, placed relative to its box, and the box's width and height."""
-    first = next(iter(next(iter(groups.values()))))
-    gap = 6.0 if first.width < 50 else _GAP
-    room = 34.0 if first.services or first.width > 200 else gap
-    total = sum(map(len, groups.values()))
-    step = first.width + gap
-    fitting = max(1, int((WIDTH - 2 * _GAP + gap) / step))
-    widest = max(len(group) for group in groups.values())
-    # about 2.5 times as many columns as rows, but at least 4
-    columns = min(fitting, widest, max(4, math.ceil(math.sqrt(total * 2.5))))
-    order = {name: place for place, name in enumerate(_TYPES)}
-    width = WIDTH if is_alone else max(130.0, 2 * _GAP + step * columns - gap)
-    placed, y = list[NodeCard](), HEAD
-    sides = iter((0.0, *(1.0, -1.0) * len(groups)))
-    for name in sorted(groups, key=lambda type: (order.get(type, len(order)), type)):
-        group = groups[name]
-        # short rows move to a side, so that lines between other types can pass them
-        side = next(sides) if len(group) < columns else 0.0
-        for start in range(0, len(group), columns):
-            row = group[start : start + columns]
-            free = (width - step * len(row) + gap) / 2
-            left = free + side * min(step * 0.6, max(free - _GAP, 0.0))
-            placed += [replace(card, x=left + step * n, y=y) for n, card in enumerate(row)]
-            y += max(card.height for card in row) + gap
-        y += room - gap
-    return placed, width, y - room + _GAP
-
-
-def by_place(
-    cards: Mapping[str, NodeCard], nodes: Sequence[Node]
-) -> tuple[dict[str, NodeCard], float]:
-    # The placed cards by node id, and the height of the map. At least one node must have a
-    # position. The nodes without one follow in rows below the others.
-    spots = {node.id: node.position for node in nodes if node.position}
-    xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]
-    widest = max(cards[id].width for id in spots)
-    # the same in both directions, so that distances on the map can be compared
-    scale = min(
-        (WIDTH - widest) / max(max(xs) - min(xs), 1.0),
-        _PLACE_HEIGHT / max(max(ys) - min(ys), 1.0),
-    )
-    placed: dict[str, NodeCard] = {}
-    for id, spot in sorted(spots.items(), key=lambda pair: (-pair[1].y, pair[1].x, pair[0])):
-        x = (spot.x - min(xs)) * scale
-        y = (max(ys) - spot.y) * scale  # north is at the top
-        card = replace(cards[id], x=x, y=y)
-        # move it down until it overlaps no other card
-        for other in sorted(placed.values(), key=lambda other: other.y):
-            is_apart = (
-                card.x + card.width + 4 <= other.x
-                or other.x + other.width + 4 <= card.x
-                or card.y + card.height + 4 <= other.y
-                or other.y + other.height + 4 <= card.y
-            )
-            if not is_apart:
-                card = replace(card, y=other.y + other.height + 6)
-        placed[id] = card
-    height = max(card.y + card.height for card in placed.values()) + _GAP
-    x = row = 0.0
-    without_position = (card for id, card in cards.items() if id not in spots)
-    for card in sorted(without_position, key=lambda card: card.id):
-        if x and x + card.width > WIDTH:
-            x, height, row = 0.0, height + row + _GAP, 0.0
-        placed[card.id] = replace(card, x=x, y=height)
-        x, row = x + card.width + _GAP, max(row, card.height)
-    return placed, height + row
-
-
-# ---- the picture, which the browser only draws, so the same state looks the same ----
-
-_LINE = 15.0
-# Up to how many nodes are drawn with their services, with their names only, and one by one.
-_MOST_DETAILED, _MOST_NAMED, _MOST_NODES = 40, 250, 1_000
-_MOST_SERVICES = 5
-_MOST_LINES = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,130 +123,269 @@ class Line:
     path: str
     tone: str
     is_lit: bool
-    source: str
-    target: str
+    query: str
     title: str
 
 
-def picture(now: Source, wanted: Filter, layout: str) -> dict[str, Any]:
+def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     # A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a
-    # position. If no drawn node has a position, nodes are drawn by cluster.
-    config = now.config
-    nodes = list(config.nodes.values())
-    rows = rows_of(now, "services") if wanted else []
-    lit_services = {row.cells["release"].parts[0].text for row in rows if wanted.matches(row)}
-    marks: dict[str, list[ServiceMark]] = {id: [] for id in config.nodes}
-    for release, _ in now.targets:
-        if isinstance(release, ServiceRelease) and release.node.id in marks:
-            tone = WORDS[word_of(now.status(release.name))]
-            source = release.key.source
-            text = f"{release.key.service} · {source}" if source else release.key.service
-            mark = ServiceMark(release.name, text, tone, release.name in lit_services)
-            marks[release.node.id].append(mark)
-    total, placed = len(nodes), [node for node in nodes if node.position]
-    layouts = ("cluster", "place") if placed else ("cluster",)
+    # position.
+    known = source.config.nodes
+    nodes = sorted(known.values(), key=lambda node: (node.cluster, node.id))
+    spots = _spots(nodes)
+    layouts = ("cluster", "place") if spots else ("cluster",)
     if layout not in layouts:
-        layout = "place" if len(placed) > len(nodes) / 2 else "cluster"
-    lit: set[str] = set()
-    if wanted:
-        # a node is also lit if it has a service or connection that matches
-        lit = {id for id, on_node in marks.items() if any(mark.is_lit for mark in on_node)}
-        for row in rows_of(now, "connections"):
-            if wanted.matches(row):
-                lit.update(row.hidden["node"])
-        own = ({"node": [n.id], "type": [n.type], "cluster": [n.cluster]} for n in nodes)
-        lit.update(texts["node"][0] for texts in own if wanted.matches(Row({}, texts)))
-        lit &= marks.keys()
-    only_lit = len(nodes) > _MOST_NAMED and 0 < len(lit) <= _MOST_NAMED
-    if only_lit:
-        nodes = [node for node in nodes if node.id in lit]
-    cards = {node.id: _card(node, marks[node.id], node.id in lit, len(nodes)) for node in nodes}
-    boxes: list[Box] = []
-    if layout == "place" and any(node.position for node in nodes):
-        cards, height = by_place(cards, nodes)
-    else:
-        cards, boxes, height = by_cluster(cards, nodes)
-    many, few = _apart(list(cards.values()), _MOST_NODES)
-    more, lines = _apart(_lines(now, wanted, cards), _MOST_LINES)
-    # The path of all that is not drawn one by one, by color: a map of thousands of nodes stays
-    # small.
-    masses, curves = defaultdict[str, str](str), defaultdict[str, str](str)
-    for card in many:
-        across = f"{card.width:.0f}"
-        masses[card.tone] += f"M{card.x:.0f} {card.y:.0f}h{across}v{card.height:.0f}h-{across}z"
-    for line in more:
-        curves[line.tone] += line.path
+        layout = "place" if len(spots) > len(nodes) / 2 else "cluster"
+
+    lit, lit_releases = set[str](), set[str]()  # a node is lit with a service or connection of it
+    links, peers = list[Link](), defaultdict[str, set[str]](set)
+    for row in rows_of(source, "connections"):
+        if known.keys() >= {*(ends := tuple(row.hidden["node"]))}:
+            is_lit = bool(wanted) and wanted.matches(row)
+            word, topics = row.cells["health"].parts[0].text, len(row.cells["topic"].parts)
+            links.append(Link(ends, row.cells["connection"].parts[0].text, topics, word, is_lit))
+            peers[ends[0]].add(ends[1])
+            peers[ends[1]].add(ends[0])
+            if is_lit:
+                lit.update(ends)
+                lit_releases.update(part.text for part in row.cells["release"].parts)
+    for row in rows_of(source, "services") if wanted else ():
+        if wanted.matches(row):
+            lit.update(part.text for part in row.cells["node"].parts)
+            lit_releases.update(part.text for part in row.cells["release"].parts)
+    marks: dict[str, list[Mark]] = {id: [] for id in known}
+    for release, _ in source.targets:
+        if release.node.id not in marks:
+            continue
+        text = (
+            " · ".join(filter(None, (release.key.service, release.key.source)))
+            if isinstance(release, ServiceRelease)
+            else f"{release.type.word} {', '.join(release.connections)}"
+        )
+        tone, is_lit = WORDS[word_of(source.status(release.name))], release.name in lit_releases
+        marks[release.node.id].append(Mark(text, tone, isinstance(release, ServiceRelease), is_lit))
+    chosen = set[str]()
+    for node in nodes if wanted else ():
+        texts = {"node": [node.id], "type": [node.type], "cluster": [node.cluster]}
+        texts["peer"] = sorted(peers[node.id]) or ["none"]
+        texts["cell"] = [_cell(spots[node.id])] if node.id in spots else []
+        if wanted.matches(Row({}, texts)):
+            chosen.add(node.id)
+    lit = (lit | chosen) & known.keys()
+
+    drawings = []
+    for name, (width, large, small, gap, most) in _DRAWINGS.items():
+        used_spots = spots if layout == "place" else {}
+        groups = _groups(nodes, peers, lit, used_spots, most)
+        drawing = Drawing(name, width, [_card(*group, marks, lit) for group in groups])
+        drawing.place(large if len(drawing.cards) <= _MOST_LARGE else small, gap, peers, used_spots)
+        drawing.connect(links, chosen, is_filtered=bool(wanted))
+        drawings.append(drawing)
     return {
-        "width": WIDTH,
-        "height": height,
-        "boxes": boxes,
-        "nodes": few,
-        "lines": lines,
-        "many_nodes": sorted(masses.items()),
-        "many_lines": sorted(curves.items()),
-        "total": total,
-        "only_lit": only_lit,
+        "drawings": drawings,
+        "total": len(nodes),
+        "lit": len(lit),
+        "has_stacks": any(card.is_stack for drawing in drawings for card in drawing.cards),
+        "is_cut": drawings[0].is_cut,
         "layout": layout,
         "layouts": layouts,
-        "is_dimmed": bool(wanted) and not only_lit,
-        "lit": len(lit),
+        "is_dimmed": bool(wanted),
     }
 
 
-_Drawn = TypeVar("_Drawn", "NodeCard", "Line")
+# ---- which nodes stand together ----
+
+# Where a node is on the map: from 0 to 1, from west to east and from north to south.
+Spot = tuple[float, float]
 
 
-def _apart(drawn: list[_Drawn], most: int) -> tuple[list[_Drawn], list[_Drawn]]:
-    """Return the parts to draw together, and at most ``most`` parts to draw one by one."""
-    if len(drawn) <= most:
-        return [], drawn
-    lit = [part for part in drawn if part.is_lit]
-    if len(lit) > most:
-        return drawn, []
-    return [part for part in drawn if not part.is_lit], lit
+def _spots(nodes: Iterable[Node]) -> dict[str, Spot]:
+    positions = {node.id: node.position for node in nodes if node.position}
+    xs, ys = ([getattr(each, axis) for each in positions.values()] or [0.0] for axis in "xy")
+    # one scale for both directions, so that distances can be compared; the map is a wide one
+    wide, high = max(xs) - min(xs), max(ys) - min(ys)
+    span = max(wide, 2 * high, 1.0)
+    left, top = min(xs) - (span - wide) / 2, max(ys) + (span / 2 - high) / 2
+    return {
+        id: ((each.x - left) / span, (top - each.y) / (span / 2)) for id, each in positions.items()
+    }
 
 
-def _card(node: Node, marks: list[ServiceMark], is_lit: bool, total: int) -> NodeCard:
-    marks = sorted(marks, key=lambda mark: (not mark.is_lit, mark.text))
-    worst_first = ("bad", "busy", "none", "good")
-    tone = min((mark.tone for mark in marks), key=worst_first.index, default="empty")
-    title = f"{node.id}, {node.type} in {node.cluster}: {len(marks)} services"
-    if node.drained:
-        title += ", drained"
-    card = NodeCard(
-        node.id, node.type, 0, 0, 14, 14, tone, is_lit, node.drained, len(marks), "", title
+def _step(part: float) -> int:
+    return min(int(part * _CELLS), _CELLS - 1)
+
+
+def _cell(spot: Spot) -> str:
+    return "/".join(str(_step(part)) for part in spot)
+
+
+def _groups(
+    nodes: Iterable[Node],
+    peers: Mapping[str, set[str]],
+    lit: set[str],
+    spots: Mapping[str, Spot],
+    most: int,
+) -> Iterator[tuple[list[Node], str]]:
+    """Yield the nodes of each card, with the filter that chooses them.
+
+    If there are too many nodes of a type, those that are connected with the same nodes form a
+    stack: the vehicles of an edge. If there are still too many, those of a cluster do; else all do.
+    By position, those in one part of the map do.
+    """
+    near = {peer for id in lit for peer in peers[id]}
+    alike: dict[tuple[str, bool, bool, bool], list[Node]] = {}
+    for node in nodes:
+        kind = node.type, node.id in spots, node.id in lit, node.id in near
+        alike.setdefault(kind, []).append(node)
+    for (_, is_placed, *is_found), same in alike.items():
+        # with a filter, nodes that have nothing to do with what it finds take little room
+        is_aside = bool(lit) and not any(is_found) and sum(map(len, alike.values())) > most
+        stacks: dict[str, list[Node]] = {exactly("node", node.id): [node] for node in same}
+        for level in (2,) if is_placed else (3, 2, 1):
+            if len(stacks) <= (_FEW_CARDS if is_aside else most):
+                break
+            stacks = {}
+            for node in same:
+                parts = [exactly("type", node.type), exactly("cluster", node.cluster)]
+                parts += [exactly("peer", id) for id in sorted(peers[node.id]) or ["none"]]
+                if is_placed:
+                    parts[1] = exactly("cell", _cell(spots[node.id]))
+                query = " ".join(parts[: level if level < 3 else None])
+                stacks.setdefault(query, []).append(node)
+        for query, stack in stacks.items():
+            yield stack, exactly("node", stack[0].id) if len(stack) == 1 else query
+
+
+def _card(nodes: list[Node], query: str, marks: Mapping[str, list[Mark]], lit: set[str]) -> Card:
+    own = marks[nodes[0].id]
+    if len(nodes) > 1:
+        own = [Mark(node.id, _tone(marks[node.id]), True, False) for node in nodes]
+    # where nothing is lit by itself, all is lit with the card
+    is_some_lit = any(mark.is_lit for mark in own)
+    own = sorted(
+        (replace(mark, is_lit=mark.is_lit or not is_some_lit) for mark in own),
+        key=lambda m: (not m.is_lit, _WORST_FIRST.index(m.tone), not m.is_service, m.text),
     )
-    if total > _MOST_NAMED:
-        return card
-    if total > _MOST_DETAILED:
-        return replace(card, width=104, height=24, label=_short(node.id, 13))
-    shown = tuple(replace(mark, text=_short(mark.text, 29)) for mark in marks[:_MOST_SERVICES])
-    more = len(marks) - len(shown)
-    height = HEAD + _LINE * (len(shown) + bool(more)) + (6 if shown else 0)
-    return replace(
-        card, width=212, height=height, label=_short(node.id, 22), services=shown, more=more
-    )
+    return Card(nodes, nodes[0].id in lit, query, own, _tone(own))
 
 
-def _short(text: str, most: int) -> str:
-    return text if len(text) <= most else f"{text[: most - 1]}…"
+# ---- the drawing: where the cards stand, and the lines between them ----
 
 
-def _lines(now: Source, wanted: Filter, cards: Mapping[str, NodeCard]) -> list[Line]:
-    # lit lines come last, on top
-    pairs: dict[tuple[str, str], list[Row]] = {}
-    for row in rows_of(now, "connections"):
-        ends = row.hidden["node"]
-        if all(end in cards for end in ends):
-            pairs.setdefault((ends[0], ends[1]), []).append(row)
-    lines = []
-    for (source, target), rows in pairs.items():
-        words = [row.cells["health"].parts[0].text for row in rows]
-        worst = min(words, key=RANKS.__getitem__)
-        topics = sum(len(row.cells["topic"].parts) for row in rows)
-        names = ", ".join(row.cells["connection"].parts[0].text for row in rows[:3])
-        title = f"{source} to {target}: {names}, {topics} topics, {worst}"
-        is_lit = bool(wanted) and any(wanted.matches(row) for row in rows)
-        path = cards[source].curve_to(cards[target])
-        lines.append(Line(path, WORDS[worst], is_lit, source, target, title))
-    return sorted(lines, key=lambda line: (line.is_lit, line.source, line.target))
+@dataclass(slots=True)
+class Gap:
+    """A gap between the cards of a row, from top to bottom; lines go through it."""
+
+    left: float
+    right: float
+    used: int = 0  # by how many lines
+
+
+@dataclass(slots=True)
+class Drawing:
+    name: str
+    width: float
+    cards: list[Card]
+    height: float = 0.0
+    lines: list[Line] = field(default_factory=list)
+    is_cut: bool = False  # lines are left out
+    rows: list[tuple[float, float, list[Gap]]] = field(default_factory=list)  # top, bottom, gaps
+
+    def place(
+        self, across: float, gap: float, peers: Mapping[str, set[str]], spots: Mapping[str, Spot]
+    ) -> None:
+        def row_of(card: Card) -> tuple[bool, int, str]:
+            node = card.nodes[0]
+            if node.id in spots:
+                return False, _step(spots[node.id][1]), ""
+            return True, (*_TYPES, node.type).index(node.type), node.type
+
+        by_row: dict[tuple[bool, int, str], list[Card]] = {}
+        for card in self.cards:
+            listed = min(len(card.marks), _MOST_LISTED + 1)
+            card.is_large = len(self.cards) <= _MOST_LARGE and not card.is_stack
+            card.width, card.height = across, 44.0 + 15.0 * listed if card.is_large else 58.0
+            by_row.setdefault(row_of(card), []).append(card)
+        columns = max(1, int((self.width - gap) // (across + gap)))
+        middles: dict[str, float] = {}  # of the card of each node that is placed
+        y = 6.0
+        for (is_by_type, _, _), cards in sorted(by_row.items()):
+            wishes: dict[int, float] = {}
+            for card in cards:
+                if is_by_type:  # below those that it is connected with, else on the right
+                    above = [middles.get(id) for node in card.nodes for id in peers[node.id]]
+                    near = [middle for middle in above if middle is not None] or [self.width]
+                else:
+                    near = [spots[node.id][0] * self.width for node in card.nodes]
+                wishes[id(card)] = sum(near) / len(near)
+            cards.sort(key=lambda c: (round(wishes[id(c)]), c.nodes[0].cluster, c.label))
+            # A long row becomes several that all reach from left to right.
+            parts = -(-len(cards) // columns)
+            for row in (cards[part::parts] for part in range(parts)):
+                free, left, right = (self.width - across * len(row)) / (len(row) + 1), gap, 0.0
+                for place, card in enumerate(row):
+                    even = free * (place + 1) + across * place
+                    card.x = even if is_by_type else max(left, wishes[id(card)] - across / 2)
+                    card.y, card.row, left = y, len(self.rows), card.x + across + gap
+                right = self.width
+                for card in reversed(row):  # back from the right edge
+                    card.x = min(card.x, right - gap - across)
+                    right = card.x
+                middles |= {node.id: card.middle for card in row for node in card.nodes}
+                edges = [0.0, *(edge for c in row for edge in (c.x, c.x + across)), self.width]
+                gaps = [Gap(*sides) for sides in zip(edges[::2], edges[1::2], strict=True)]
+                self.rows.append((y, max(card.bottom for card in row), gaps))
+                y = self.rows[-1][1] + _CHANNEL
+        self.height = y - _CHANNEL * 0.4
+
+    def connect(self, links: Iterable[Link], chosen: set[str], *, is_filtered: bool) -> None:
+        card_of = {node.id: card for card in self.cards for node in card.nodes}
+        between: dict[tuple[int, int], tuple[Card, Card, list[Link]]] = {}
+        for link in links:
+            ends = (card_of[id] for id in link.ends)
+            upper, lower = sorted(ends, key=lambda card: (card.row, card.x))
+            if upper is not lower:
+                pair = between.setdefault((id(upper), id(lower)), (upper, lower, []))
+                pair[2].append(link)
+        for upper, lower, carried in between.values():
+            is_lit = any(link.is_lit or not chosen.isdisjoint(link.ends) for link in carried)
+            worst = min((link.word for link in carried), key=RANKS.__getitem__)
+            if is_filtered and not is_lit:
+                continue
+            is_late = WORDS[worst] in ("bad", "busy")
+            if len(between) > _MOST_LINES and not (is_lit or is_late):
+                self.is_cut = True
+                continue
+            names = ", ".join(link.name for link in carried[:3])
+            names += f" and {len(carried) - 3} more" if len(carried) > 3 else ""
+            topics = sum(link.topics for link in carried)
+            title = f"{upper.label} and {lower.label}: {names}; {topics} topics; {worst}"
+            singles = [card for card in (upper, lower) if not card.is_stack]
+            query = " ".join(exactly("node", card.nodes[0].id) for card in singles)
+            line = Line(self._path(upper, lower), WORDS[worst], is_lit, query, title)
+            self.lines.append(line)
+
+    def _path(self, upper: Card, lower: Card) -> str:
+        """Return a path that goes down through a gap between the cards of each row on its way."""
+        x, y, end = upper.middle, self.rows[upper.row][1], lower.middle
+        path = f"M{x:.1f} {upper.bottom:.1f}V{y:.1f}"
+        if upper.row == lower.row:  # in an arc below both
+            deep = y + _CHANNEL * 0.7
+            path += f"C{x:.1f} {deep:.1f} {end:.1f} {deep:.1f} {end:.1f} {y:.1f}"
+            return f"{path}V{lower.bottom:.1f}"
+        for number in range(upper.row + 1, lower.row + 1):
+            (top, bottom, gaps), to = self.rows[number], end
+            if number < lower.row:
+                straight = x + (end - x) / (lower.row - number + 1)
+                gap = min(gaps, key=lambda gap: max(gap.left - straight, straight - gap.right))
+                free = gap.right - gap.left
+                if free > 40:
+                    to = min(max(straight, gap.left + 8), gap.right - 8)
+                else:  # lines through a narrow gap stand side by side
+                    to = (gap.left + gap.right) / 2 + (gap.used % 5 - 2) * free / 8
+                    gap.used += 1
+            half = (y + top) / 2
+            path += f"C{x:.1f} {half:.1f} {to:.1f} {half:.1f} {to:.1f} {top:.1f}"
+            path += f"V{bottom:.1f}" if number < lower.row else ""
+            x, y = to, bottom
+        return path

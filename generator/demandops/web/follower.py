@@ -37,8 +37,7 @@ class ClusterWatch:
         self._caches = object_caches(clusters, on_change, REAL)
         self.clusters = frozenset(self._caches)
         self._domains = set[ClusterDomain]()
-        # The word for the health of each release, and since when it is not healthy.
-        self._seen: dict[str, tuple[str, float | None]] = {}
+        self._seen: dict[str, str] = {}  # the word for the health of each release
         self._changes = deque[HealthChange](maxlen=_KEPT)
 
     @property
@@ -59,21 +58,12 @@ class ClusterWatch:
         # everything would be `waiting` for seconds after each commit.
         reported = statuses(targets, commit, caches, repository, repository.changed_paths)
         status_of = {target.name: status for target, status in zip(targets, reported, strict=True)}
-        at = REAL.monotonic()
         for name, status in status_of.items():
-            (before, began), after = self._seen.get(name, ("", None)), word_of(status)
-            if before == after:
-                continue
-            lasted = None
-            if after == "healthy":
-                lasted, began = None if began is None else at - began, None
-            elif after != "unknown" and began is None:
-                began = at
-            self._seen[name] = after, began
-            if before:  # the first health that a cluster reports of a release is no change
+            before, after = self._seen.get(name, ""), word_of(status)
+            self._seen[name] = after
+            if before and before != after:  # the first health that a cluster reports is no change
                 reason = status.health.reason
-                change = HealthChange(REAL.now(), name, before, after, reason, lasted)
-                self._changes.append(change)
+                self._changes.append(HealthChange(REAL.now(), name, before, after, reason))
         self._seen = {name: self._seen[name] for name in status_of}
         return replace(
             source,
@@ -94,7 +84,7 @@ class ClusterWatch:
 
 log = logging.getLogger("demandops")
 
-# How many of the newest commits the time line and the rates show.
+# How many of the newest commits the time line shows.
 MOST_COMMITS = 5_000
 
 # The pause in seconds between checks of a local repository, which cost little.

@@ -129,6 +129,12 @@ class Cause:
     requesters: tuple[str, ...] = ()
     demands: tuple[str, ...] = ()
 
+    @property
+    def is_look(self) -> bool:
+        # the command mends nothing, it only shows more
+        looks = (" describe ", "git show ", "demandops check")
+        return any(look in self.command for look in looks) and "| kubectl" not in self.command
+
     def row(self) -> Row:
         texts = {
             "release": self.releases,
@@ -328,28 +334,35 @@ def _awaited(now: Source, not_rendered: list[str]) -> Iterator[Cause]:
 
 
 def _of_releases(now: Source) -> Iterator[Cause]:
-    together: dict[tuple[str, str, str, str], list[str]] = {}
+    # One reason of several objects is one cause, with the command for the first object.
+    together: dict[tuple[Kind, str, str, str, str, str], list[tuple[str, str]]] = {}
+    kinds: dict[str, Kind] = {"failing": "failing", "waiting": "waiting"}
     for name, release in now.releases.items():
-        status = now.status(name)
-        word = word_of(status)
+        health, word = now.status(name).health, word_of(now.status(name))
         if word not in ("healthy", "unknown"):
-            health = status.health
-            key = (word, health.object, health.reason, release.node.cluster)
-            together.setdefault(key, []).append(name)
-    for (word, object, reason, cluster), names in together.items():
-        releases = [now.releases[name] for name in names]
-        first, several = releases[0], len(names) > 1
-        what = Part(first.description, "release", {"name": names[0]})
+            kind, reason = kinds.get(word, "starting"), health.reason
+            who, how, command = remedy_of(
+                kind, release, now.config, health.object, reason, now.last_change
+            )
+            is_cluster = health.object.startswith("cluster ")
+            sort = health.object if is_cluster else health.object.partition(" ")[0]
+            key = kind, sort, reason, release.node.cluster, who, how
+            together.setdefault(key, []).append((name, command))
+    for (kind, sort, reason, cluster, who, how), members in together.items():
+        names = [name for name, _ in members]
+        releases, several = [now.releases[name] for name in names], len(names) > 1
+        what = Part(releases[0].description, "release", {"name": names[0]})
         if several:
-            query = {"q": f"cluster={cluster}"}
-            what = Part(f"{len(names)} releases in {cluster}", "services", query)
-        kind: Kind = "failing" if word == "failing" else "starting"
+            query = f"{exactly('cluster', cluster)} {exactly('health', kind)}"
+            what = Part(f"{len(names)} releases in {cluster}", "services", {"q": query})
         fail, have, are = ("fail", "have", "are") if several else ("fails", "has", "is")
         why = fail if kind == "failing" else f"{are} starting and not ready yet"
-        if word == "waiting":
-            kind, why = "waiting", f"{have} not been applied by the cluster yet"
-        if object.startswith("cluster "):
-            why = f"cannot be seen, because {object} cannot be read"
+        if kind == "waiting":
+            why = f"{have} not been applied by the cluster yet"
+        objects = dict.fromkeys(now.status(name).health.object for name in names)
+        object = next(iter(objects)) + (" and others" if len(objects) > 1 else "")
+        if sort.startswith("cluster "):
+            why = f"cannot be seen, because {sort} cannot be read"
         claims = [claim for name in names for claim in now.claims_of_releases[name]]
         applications: dict[str, None] = {}
         for name, release in zip(names, releases, strict=True):
@@ -364,7 +377,9 @@ def _of_releases(now: Source) -> Iterator[Cause]:
             kind,
             what,
             why,
-            *remedy_of(kind, first, now.config, object, reason, now.last_change),
+            who,
+            how,
+            members[0][1],
             since=min(times, default=None),
             told=f"{object}: {reason}" if object else reason,
             releases=tuple(names),

@@ -7,6 +7,7 @@ import shlex
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from datetime import timezone
+from itertools import islice
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -29,14 +30,16 @@ from demandops import __version__
 from demandops.base import settings
 from demandops.base.errors import DemandOpsError, InvalidInput
 from demandops.base.quoting import escaped, lines
-from demandops.model.config.base_model import relative
+from demandops.model.config.base_model import parse_time, relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
 from demandops.views.source import WORDS, Source
-from demandops.web import fleet_map, lists, not_ready, time_line
+from demandops.views.vocabulary import decision_text
+from demandops.web import fleet_map, lists, not_ready, overview, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Part, Row, rows_of
-from demandops.web.release_view import explained_demand, explained_release
+from demandops.web.thing import thing
+from demandops.web.time_line import Event
 
 # ---- the views, by address ----
 
@@ -44,16 +47,16 @@ from demandops.web.release_view import explained_demand, explained_release
 _KEPT = ("at", "q")
 
 NAVIGATION = (
-    ("", "Not ready"),
+    ("", "Overview"),
     ("map", "Map"),
     *((name, kind.title) for name, kind in LISTS.items()),
     ("timeline", "Time line"),
     ("overrides", "Overrides"),
-    ("rates", "Rates"),
 )
 
 
 _MOST_CAUSES = 100
+_NEWEST = 8  # changes
 
 Data = dict[str, Any]
 View = Callable[["ViewRequest"], tuple[str, Data]]
@@ -84,19 +87,28 @@ class ViewRequest:
         query = f"?{urlencode(params)}" if params else ""
         return f"/{self.path if path is None else path}{query}"
 
+    def events(self) -> list[Event]:
+        every = time_line.events(self.follower.history, self.follower.health_changes)
+        return [event for event in every if not self.filter or self.filter.matches(event.row())]
+
     def link(self, part: Part) -> str:
         # with its own filter instead of the current one
         return self.to(part.view, **{"q": "", **part.params})
 
 
-def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
-    causes = not_ready.causes(asked.source, asked.filter)
-    applications = not_ready.applications(asked.source, causes, asked.filter)
-    return "not_ready.html.j2", {
+def _overview(asked: ViewRequest) -> tuple[str, Data]:
+    source = asked.source
+    causes = not_ready.causes(source, asked.filter)
+    moment = source.now if source.is_newest else source.entry.time
+    events = [event for event in asked.events() if event.time <= moment]
+    return "overview.html.j2", {
+        "figures": overview.figures(source, asked.filter, events, moment),
         "causes": causes[:_MOST_CAUSES],
         "total": len(causes),
-        "applications": applications,
+        "applications": not_ready.applications(source, causes, asked.filter),
         "tones": {**WORDS, **not_ready.KINDS},
+        "events": islice(overview.newest(events), _NEWEST),
+        "overrides": source.overrides,
     }
 
 
@@ -122,18 +134,16 @@ def _list(asked: ViewRequest) -> tuple[str, Data]:
 def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     now, lane = asked.source, asked.get("lane")
     lanes = {lane} if lane in time_line.LANES else time_line.LANES
-    events = [
-        event
-        for event in time_line.events(asked.follower.history, asked.follower.health_changes)
-        if event.lane in lanes and (not asked.filter or asked.filter.matches(event.row()))
-    ]
+    events = [event for event in asked.events() if event.lane in lanes]
+    span, events = time_line.within(events, asked.get("span"), now.now)
     chosen = None if now.is_newest else (now.entry.time, now.commit)
     changed: list[str] = []
     if asked.get("at"):
         changed = asked.follower.reader().files_changed_by(now.commit)
     shown, page, pages = lists.page_of(events, asked.page(), size=50)
     return "timeline.html.j2", {
-        "strip": time_line.strip(events, now.now, asked.get("span"), chosen),
+        "strip": time_line.strip(events, now.now, span, chosen),
+        "span": span,
         "lanes": time_line.LANES,
         "lane": lane,
         "spans": time_line.SPANS,
@@ -161,37 +171,26 @@ def _overrides(asked: ViewRequest) -> tuple[str, Data]:
     return "overrides.html.j2", {"entries": entries}
 
 
-def _rates(asked: ViewRequest) -> tuple[str, Data]:
-    span = asked.get("span") if asked.get("span") in time_line.SPANS else "1d"
-    health = asked.follower.health_changes
-    commits = [
-        commit
-        for commit in asked.follower.history
-        if asked.filter.matches(time_line.of_commit(commit).row())
-    ]
-    plots = time_line.plots(commits, health, asked.source.now, span)
-    size = {"width": time_line.WIDTH, "height": time_line.HEIGHT}
-    return "rates.html.j2", {"plots": plots, "span": span, "spans": time_line.SPANS, **size}
+def _thing(asked: ViewRequest) -> tuple[str, Data]:
+    # `/demand?id=` and `/release?name=` are in people's bookmarks
+    kind = asked.get("kind") if asked.path == "thing" else asked.path
+    name = asked.get("id") or asked.get("name")
+    health = asked.follower.health_changes if asked.source.is_newest else ()
+    return "thing.html.j2", thing(asked.source, name, kind, health)
 
 
 VIEWS: Mapping[str, View] = {
-    "/": _not_ready,
+    "/": _overview,
     "/map": lambda asked: (
         "map.html.j2",
         {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
     ),
     **{f"/{name}": _list for name in LISTS},
-    "/demand": lambda asked: (
-        "demand.html.j2",
-        {"demand": explained_demand(asked.source, asked.follower.reader(), asked.get("id"))},
-    ),
-    "/release": lambda asked: (
-        "release.html.j2",
-        {"release": explained_release(asked.source, asked.follower.reader(), asked.get("name"))},
-    ),
+    "/thing": _thing,
+    "/demand": _thing,
+    "/release": _thing,
     "/timeline": _timeline,
     "/overrides": _overrides,
-    "/rates": _rates,
 }
 
 
@@ -264,6 +263,8 @@ class Site:
             ),
             "ago": relative,
             "iso": lambda at: f"{at.astimezone(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
+            "moment": parse_time,
+            "decision": decision_text,
             "sh": shlex.quote,
         }
         self.application = Starlette(

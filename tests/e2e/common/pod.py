@@ -9,7 +9,7 @@ and there ROS 2 would send messages through shared memory, if it could. A client
 container would not receive such messages.
 
 By default the image consists of this machine's programs and this checkout. If ``E2E_IMAGE_ROOT``
-names a folder, the image is the root file system in that folder (made by ``deploy/fresh-root``).
+names a folder, the image is the root file system in that folder (``root`` of ``deploy/image``).
 """
 
 from __future__ import annotations

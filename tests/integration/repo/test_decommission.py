@@ -23,7 +23,7 @@ from tests.kit.rig import Person, goal
 @pytest.fixture
 def decommission(demandops: Run, bare: Path) -> Run:
     def ran(*args: object) -> Ran:
-        return demandops("decommission", *args, "--state-repo", bare)
+        return demandops("decommission", *args, "--yes", "--state-repo", bare)
 
     return ran
 
@@ -34,7 +34,7 @@ def test_a_node_gives_up_all_and_can_be_deleted_from_the_inventory(
     """A running generator fetches the commit of `decommission` and the person's deletion."""
     with rig.running(url, fetch_interval=0.1) as generator:
         rig.book(generator, goal(1), goal(2), goal(6))
-        code, out, err = demandops("decommission", "vehicle01", "--state-repo", url)
+        code, out, err = demandops("decommission", "vehicle01", "--yes", "--state-repo", url)
         assert (code, err) == (0, "")
         commit = rig.commits(bare)[-1]
         assert out.splitlines() == [
@@ -98,7 +98,7 @@ def test_what_releases_nothing_changes_nothing(
     tip = rig.tip(bare)
     code, out, _ = decommission("vehicle01", "--dry-run")
     assert (code, "would be released: connection 'vehicle01/edge'" in out) == (0, True)
-    assert "remove clusters/" in out
+    assert "RELEASES 2 claims and STOPS 2 releases of 2 requesters\n" in out
     assert decommission("cloud") == (0, "'cloud' holds nothing\n", "")
     assert decommission("cloud", "--output", "json").json()["outcome"] == "unchanged"
     assert "did you mean 'vehicle01'?" in decommission("vehicel01").err

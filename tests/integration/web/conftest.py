@@ -24,7 +24,7 @@ from tests.kit.generator import book, running, wait_until
 from tests.kit.html import Page
 
 VIEWS = ("/", "/map", "/demands", "/services", "/connections", "/leases", "/timeline",
-         "/overrides", "/rates")  # fmt: skip
+         "/overrides")  # fmt: skip
 DENY = """apiVersion: demandops/v1
 kind: Override
 reason: The road is closed

@@ -25,6 +25,7 @@ from tests.integration.web.conftest import DENY, VIEWS, Look, causes
 from tests.kit import goals
 from tests.kit.config import override
 from tests.kit.generator import Proposed, book, running, wait_until
+from tests.kit.html import Page
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, Person, away, git
 
@@ -135,7 +136,7 @@ def test_a_lease_is_listed_with_its_end(booked: Generator, look: Look) -> None:
 def test_a_release_that_stopped_is_still_explained(booked: Generator, look: Look) -> None:
     book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
     page = look("/release", name=DETECTION)
-    assert "It does not run" in page.text and "stopped" in page.texts("td")
+    assert "It is gone since" in page.text and "stopped" in page.texts("td")
     assert look("/release", 404, name="never").text.startswith("Nothing to show")
 
 
@@ -156,7 +157,7 @@ def test_the_file_that_stops_a_release_stops_it(
     name = text.splitlines()[0].removeprefix("# ")
     person.change({name: text})
     overridden(booked)
-    assert look("/release", name=release).texts("h1") != [f"{release} unknown"]
+    assert look("/release", name=release).texts("h1") != [f"Release {release} unknown"]
     assert told.format(name) in look("/").text
     gone = {Path(path).stem for path in before - set(state.manifests())}
     assert release in gone
@@ -201,6 +202,48 @@ def test_the_time_line_has_lanes_for_demands_overrides_and_people(
     assert len(look("/timeline", q="who:vehicle01").texts("tr")[1:]) == 1
 
 
+def test_a_span_of_the_time_line_lists_only_its_events(booked: Generator, look: Look) -> None:
+    def commits(page: Page) -> list[str]:
+        return [text.split()[-1] for text in page.texts("tr")[1:]]
+
+    everything = look("/timeline", span="all")
+    assert len(commits(everything)) == 3 and "Create the state repo" in everything.text  # long ago
+    page = look("/timeline", span="15min")
+    assert commits(page) == commits(everything)[:2]
+    assert "2 events in the last 15min" in page.text
+    dots = [title for title in page.texts("title") if " UTC, " in title]
+    more = [int(count) for title in dots for count in re.findall(r"and (\d+) more", title)]
+    assert len(dots) + sum(more) == 2  # the drawing has the same events as the list
+    assert len(commits(look("/timeline", span="7d", q="who:vehicle01"))) == 1
+
+
+def test_the_overview_has_the_fleet_in_figures(
+    booked: Generator, person: Person, look: Look
+) -> None:
+    def figures(**asked: str) -> list[str]:
+        return look("/", **asked).texts("li")[:7]
+
+    assert figures() == [
+        "3 services 3 unknown",
+        "3 connections 3 unknown",
+        "2 demands 2 unknown",
+        "3 requesters",
+        "4 of 7 nodes used",
+        "0 waiting",
+        "2 changes in the last hour 2 booked, 0 released in the last hour "
+        "2 booked, 0 released in the last day",
+    ]
+    book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
+    person.override(roadworks=DENY)
+    overridden(booked)
+    told = figures(q="vehicle01")
+    assert told[1:4] == ["1 connection 1 unknown", "1 demand 1 unknown", "2 requesters"]
+    assert "1 booked, 0 released in the last day" in told[-1]
+    assert "1 booked, 1 released" not in told[-1] and "1 released in the last day" in figures()[-1]
+    page = look("/")
+    assert "1 override: 1 in force" in page.text
+
+
 def test_nodes_are_drawn_where_they_are_and_cover_no_other(
     booked: Generator, person: Person, follower: Follower
 ) -> None:
@@ -216,17 +259,17 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
     drawn = fleet_map.picture(follower.newest, Filter(""), "")
     assert (drawn["layout"], drawn["layouts"]) == ("place", ("cluster", "place"))
     for layout in drawn["layouts"]:
-        cards = fleet_map.picture(follower.newest, Filter(""), layout)["nodes"]
-        for one in cards:
-            assert one.x >= 0 and one.x + one.width <= fleet_map.WIDTH
-            assert not [o for o in cards if o is not one and _cover(one, o)]
-    by_id = {card.id: card for card in drawn["nodes"]}
+        for drawing in fleet_map.picture(follower.newest, Filter(""), layout)["drawings"]:
+            for card in drawing.cards:
+                assert card.x >= 0 and card.x + card.width <= drawing.width
+                assert not [o for o in drawing.cards if o is not card and _cover(card, o)]
+    by_id = {card.label: card for card in drawn["drawings"][0].cards}
     ids = [node["id"] for node in nodes["nodes"]]
     assert by_id[ids[0]].x < by_id[ids[1]].x < by_id[ids[2]].x
     assert by_id[ids[-1]].y < by_id[ids[0]].y
 
 
-def _cover(one: fleet_map.NodeCard, other: fleet_map.NodeCard) -> bool:
+def _cover(one: fleet_map.Card, other: fleet_map.Card) -> bool:
     beside = one.x + one.width <= other.x or other.x + other.width <= one.x
     return not (beside or one.y + one.height <= other.y or other.y + other.height <= one.y)
 

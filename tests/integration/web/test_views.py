@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.base.errors import StateRepoError
 from demandops.cluster.health import Health
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
 from demandops.model.demand.goals import read_goal
@@ -20,7 +19,7 @@ from demandops.web import fleet_map, time_line
 from demandops.web.follower import Follower
 from demandops.web.lists import Filter, page_of, rows_of
 from demandops.web.not_ready import remedy_of
-from demandops.web.release_view import explained_demand
+from demandops.web.thing import thing
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes
@@ -119,9 +118,25 @@ def test_not_everything_is_ready_while_a_cluster_is_not_watched(
     assert "Whether pods run on c-its is unknown" in page.text
 
 
-def test_an_unknown_release_is_told_with_the_commit_that_was_searched(look: Look) -> None:
+def test_each_kind_of_thing_has_a_page(look: Look) -> None:
+    for kind, name, told in (
+        ("node", "edge", "in cluster c-its"),
+        ("requester", "station00", "vehicle01/edge"),
+        ("application", "edge/object_detection_fusion", DETECTION),
+        ("connection", "vehicle00/edge", "MQTT"),
+        ("appdef", "object-detection-fusion", "edge/object_detection_fusion"),
+        ("service", "object-detection", DETECTION),
+        ("domain", "perception", "namespace perception"),
+    ):
+        page = look("/thing", kind=kind, name=name)
+        assert page.texts("h1")[0].startswith(f"{kind.capitalize()} {name} ")
+        assert told in page.text, kind
+        assert page.texts("h2")[-1] == "Time line"
+
+
+def test_an_unknown_release_is_told(look: Look) -> None:
     page = look("/release", status=404, name="od-nowhere")
-    assert "there was no release 'od-nowhere'" in page.text
+    assert "no release is called 'od-nowhere'" in page.text
 
 
 def test_an_old_bootstrap_file_and_an_object_of_no_release_are_causes(follower: Follower) -> None:
@@ -194,27 +209,74 @@ def test_the_page_shows_the_claims_at_an_earlier_commit(look: Look, state: GitRe
 def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:
     now = follower.newest
     demand = next(one.demand for one in now.state.ledger if "vehicle01" in one.requesters)
-    lit = fleet_map.picture(now, Filter(f"demand={demand}"), "")
-    assert {node.id for node in lit["nodes"] if node.is_lit} == {"edge", "station00", "vehicle01"}
-    services = {one.name for node in lit["nodes"] for one in node.services if one.is_lit}
-    assert DETECTION not in services and "od-edge-station00" in services
+    wide, _ = fleet_map.picture(now, Filter(f"demand={demand}"), "")["drawings"]
+    lit = [card for card in wide.cards if card.is_lit]
+    assert {card.label for card in lit} == {"edge", "station00", "vehicle01"}
+    on_edge = {mark.text: mark.is_lit for card in lit for mark in card.marks}
+    assert on_edge["object-detection · station00"] and on_edge["mqtt vehicle01/edge"]
+    assert not on_edge["object-detection · vehicle00"]
 
 
-def test_a_large_fleet_is_drawn_at_once_and_a_filter_draws_its_nodes(follower: Follower) -> None:
+def fleet_of(follower: Follower, vehicles: int, edges: int = 1) -> Source:
+    """Return the newest source with more nodes, which demand nothing."""
     config = follower.newest.config
-    model, far = next(iter(config.nodes.values())), [f"far{number}" for number in range(1000)]
-    nodes = {**config.nodes, **{id: model.model_copy(update={"id": id}) for id in far}}
-    now = changed(follower, config=replace(config, nodes=nodes))
-    state = now.state
-    drawn = fleet_map.picture(now, Filter(""), "")
-    assert (drawn["nodes"], drawn["total"]) == ([], len(state.config.nodes))
-    squares = sum(path.count("M") for _, path in drawn["many_nodes"])
-    assert squares == len(state.config.nodes)
-    few = fleet_map.picture(now, Filter("node=far7"), "")
-    assert [node.id for node in few["nodes"]] == ["far7"] and few["only_lit"]
-    # the filter finds too many nodes to draw them alone, so the whole fleet is drawn
-    many = fleet_map.picture(now, Filter("node:far"), "")
-    assert many["is_dimmed"] and {node.id for node in many["nodes"]} == set(far)
+    model, more = config.nodes["vehicle00"], dict(config.nodes)
+    for type, count in (("edge", edges), ("vehicle", vehicles)):
+        for number in range(count):
+            id = f"far-{type}{number}"
+            more[id] = model.model_copy(update={"id": id, "type": type})
+    return changed(follower, config=replace(config, nodes=more))
+
+
+def test_many_nodes_are_drawn_as_stacks_that_a_filter_opens(follower: Follower) -> None:
+    source = fleet_of(follower, 1000)
+    for drawing in fleet_map.picture(source, Filter(""), "")["drawings"]:
+        assert sum(len(card.nodes) for card in drawing.cards) == len(source.config.nodes)
+        (stack,) = [card for card in drawing.cards if len(card.nodes) >= 1000]
+        assert stack.label.endswith(" vehicles")
+    # a stack's own filter chooses its nodes, and a filter that finds few draws each of them
+    for query, count in ((stack.query, len(stack.nodes)), ("node=far-vehicle7", 1)):
+        found = fleet_map.picture(source, Filter(query), "")
+        assert found["lit"] == count
+    (lit,) = [card for card in found["drawings"][0].cards if card.is_lit]
+    assert lit.label == "far-vehicle7" and len(found["drawings"][0].cards) < 20
+
+
+@pytest.mark.parametrize("query", ["", "edge", "vehicle01"])
+@pytest.mark.parametrize(("vehicles", "edges"), [(0, 0), (25, 20), (200, 20)])
+def test_no_line_runs_behind_a_card(
+    follower: Follower, vehicles: int, edges: int, query: str
+) -> None:
+    source = fleet_of(follower, vehicles, edges)
+    for drawing in fleet_map.picture(source, Filter(query), "cluster")["drawings"]:
+        assert drawing.lines
+        for line in drawing.lines:
+            for x, y in points(line.path):
+                assert 0 <= x <= drawing.width and 0 <= y <= drawing.height
+                assert not [
+                    card.label
+                    for card in drawing.cards
+                    if card.x < x < card.x + card.width and card.y < y < card.y + card.height
+                ]
+
+
+def points(path: str) -> list[tuple[float, float]]:
+    """Return points on a path of the commands M, V and C, close to each other."""
+    here, found = (0.0, 0.0), list[tuple[float, float]]()
+    for command, text in re.findall(r"([MVC])([^MVC]*)", path):
+        numbers = [float(number) for number in text.split()]
+        if command == "V":
+            numbers = [here[0], here[1], here[0], numbers[0], here[0], numbers[0]]
+        ends = list(zip(numbers[::2], numbers[1::2], strict=True))
+        if command != "M":
+            for step in range(33):
+                t = step / 32
+                weights = ((1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3)
+                at = zip(*(here, *ends), strict=True)
+                x, y = (sum(w * v for w, v in zip(weights, values, strict=True)) for values in at)
+                found.append((x, y))
+        here = ends[-1]
+    return found
 
 
 def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
@@ -228,8 +290,7 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     assert cause.why == "waits for room on a node"
     rows = [row for row in rows_of(now, "demands") if Filter("demand=later").matches(row)]
     assert [row.cells["health"].parts[0].text for row in rows] == ["waits for room"]
-    with pytest.raises(StateRepoError, match="'later' holds nothing, because it waits for room"):
-        explained_demand(now, follower.reader(), "later")
+    assert thing(now, "later", "demand", ())["word"] == "waiting"
 
 
 def test_the_time_line_fills_the_drawing(shown: Shown) -> None:

@@ -1,36 +1,37 @@
-"""``demandops new``: files of a state repo for people to edit, valid from the start."""
+"""``demandops new``: files for people to edit, valid from the start."""
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import click
 
 from demandops.base import addresses
 from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.naming import PATTERN_WORDS
+from demandops.base.quoting import quoted
 from demandops.base.settings import data_folder
-from demandops.cli.authoring import scaffold
-from demandops.cli.authoring.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
-from demandops.cli.changes.override import effect_options, override_text
 from demandops.cli.json_output import Command, output_option, show
 from demandops.cli.output import busy
+from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.decide.state import State, try_configuration
+from demandops.model.config.base_model import document
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
 from demandops.model.config.load import load
+from demandops.model.config.policy import matches
 from demandops.model.config.registry import Image
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo import new_repo
 from demandops.repo.git import tree as trees
 from demandops.repo.merge_check import edited_checkout
+from demandops.templating import charts
 from demandops.templating.evaluator import EVALUATE
-
-_INPUT = re.compile(r"(?P<role>[^=]+)=(?P<type>.+)")
-_SHORT_TYPE = re.compile(r"(?P<package>\w+)/(?P<name>\w+)")
-_SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
-Files = Mapping[str, str]
 
 
 def _directory(what: str) -> Callable[[Command], Command]:
@@ -46,7 +47,7 @@ def _directory(what: str) -> Callable[[Command], Command]:
 
 @click.group()
 def new() -> None:
-    """Write a new application, override or image.
+    """Write a new application or image.
 
     The files in the state repo are valid as they are: `demandops check` passes. `new image` writes
     to the repository of a ROS package instead. The command changes no existing file and commits
@@ -56,6 +57,180 @@ def new() -> None:
     Examples:
       demandops new application tracking
     """
+
+
+def _write_files(directory: Path, files: Mapping[str, str], output: str, then: list[str]) -> None:
+    if there := [path for path in files if (directory / path).exists()]:
+        raise StateRepoError(f"{directory / there[0]} exists; move it away (nothing was changed)")
+    for path, text in files.items():
+        (directory / path).parent.mkdir(parents=True, exist_ok=True)
+        (directory / path).write_text(text, encoding="utf-8")
+    lines = [f"new: {directory / path}" for path in sorted(files)]
+    show(output, {"files": sorted(files)}, [*lines, *then])
+
+
+def _templates(what: str) -> dict[str, str]:
+    folder = data_folder("templates") / "scaffold" / what
+    return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
+
+
+def _filled(text: str, given: Mapping[str, str]) -> str:
+    return re.sub("@([A-Z_]+)@", lambda match: given[match[1]], text)
+
+
+# ---- ``new image``: a container file and pipelines for a ROS package ----
+
+_PATHS = {
+    "Containerfile": "Containerfile",
+    "github-workflow.yml": ".github/workflows/image.yml",
+    "gitlab-ci.yml": ".gitlab-ci.yml",
+    "propose-image": "ci/propose-image",
+}
+# The templates put these values into YAML and shell scripts as they are, so no character of them
+# may need quotes.
+_IMAGE_NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
+_REPOSITORY = re.compile(r"(?P<host>[a-z0-9.-]+(:[0-9]+)?)(/[a-z0-9._-]+)+")
+_URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A-Za-z0-9._~/-]+")
+
+
+@new.command()
+@click.argument("name")
+@click.option(
+    "--repository",
+    required=True,
+    metavar="HOST/PATH",
+    help="The image's repository in a container registry, such as ghcr.io/me/cam.",
+)
+@click.option(
+    "--state-repo",
+    "state_repo",
+    required=True,
+    metavar="URL",
+    help="The state repo to which the image is proposed.",
+)
+@_directory("The repository of the ROS package.")
+@output_option
+def image(name: str, repository: str, state_repo: str, directory: Path, output: str) -> None:
+    """Write a container file and pipelines for a ROS package of your own.
+
+    NAME is the image's name in registry/images/. The pipelines, for GitHub and GitLab, test the
+    package. When you push a tag, they also build the image and propose it, with its digest, to the
+    state repo.
+
+    \b
+    Examples:
+      demandops new image cam --repository ghcr.io/me/cam --state-repo git@host:f
+    """
+    url, parts = addresses.as_git_url(state_repo), _REPOSITORY.fullmatch(repository)
+    if not _IMAGE_NAME.fullmatch(name):
+        message = "is no valid name; use at most 63 of a-z, 0-9 and -, and no - at its ends"
+        raise InvalidInput.at("NAME", f"{quoted(name)} {message}")
+    if parts is None:
+        message = "is no valid repository; write HOST/PATH in lower case, without a tag"
+        raise InvalidInput.at("--repository", f"{quoted(repository)} {message}")
+    if not _URL.fullmatch(url):
+        message = "is no valid URL; write https://HOST/PATH or git@HOST:PATH"
+        raise InvalidInput.at("--state-repo", f"{quoted(state_repo)} {message}")
+    given = {"NAME": name, "REPOSITORY": repository, "HOST": parts["host"], "STATE_REPO": url}
+    files = {_PATHS[file]: _filled(text, given) for file, text in _templates("image").items()}
+    then = ["keep .github/workflows/image.yml or .gitlab-ci.yml, whichever you need"]
+    _write_files(directory, files, output, then)
+
+
+# ---- ``new application`` ----
+#
+# The application's services form a chain: the first service reads the application's inputs, and
+# each further service reads the outputs of the service before it. One image contains the launch
+# files of all services.
+
+_INPUT = re.compile(r"(?P<role>[^=]+)=(?P<type>.+)")
+_SHORT_TYPE = re.compile(r"(?P<package>\w+)/(?P<name>\w+)")
+_SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
+
+
+@dataclass(frozen=True, slots=True)
+class _Service:
+    name: str
+    package: str
+    launch_file: str
+
+    @property
+    def role(self) -> str:  # of its output, as the next service reads it
+        return self.name.replace("-", "_")
+
+
+def _input(text: str) -> tuple[str, str]:
+    if not (match := _INPUT.fullmatch(text)):
+        raise click.BadParameter(
+            f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image",
+            param_hint="--input",
+        )
+    if short := _SHORT_TYPE.fullmatch(match["type"]):
+        raise click.BadParameter(
+            f"'{text}' has no message type of ROS 2; write "
+            f"{match['role']}={short['package']}/msg/{short['name']}",
+            param_hint="--input",
+        )
+    return match["role"], match["type"]
+
+
+def _service(text: str) -> _Service:
+    if not (match := _SERVICE.fullmatch(text)):
+        raise click.BadParameter(
+            f"'{text}' is not NAME=PACKAGE/FILE; write it like "
+            "detector=my_package/detector.launch.py",
+            param_hint="--service",
+        )
+    return _Service(match["name"], match["package"], match["file"])
+
+
+def _image(text: str) -> Image:
+    try:
+        image = addresses.image(text)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--image") from None
+    if not (image.tag or image.digest):
+        raise click.BadParameter(
+            f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
+        )
+    return Image(repository=image.name, tag=image.tag or None, digest=image.digest or None)
+
+
+# Maps an option to the question that asks for its values, what reads a value, and how many may be
+# given; None means any number.
+_QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
+    "--input": (
+        "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; separate several by spaces",
+        _input,
+        None,
+    ),
+    "--service": (
+        "Services, as name=package/file, such as detector=my_package/detector.launch.py; separate "
+        "several by spaces",
+        _service,
+        None,
+    ),
+    "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
+}
+
+
+def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
+    """Ask until the answer is at most ``most`` valid words; ``check`` raises for another word."""
+
+    def valid(answer: str) -> tuple[str, ...]:
+        if not (words := tuple(answer.split())):
+            raise click.UsageError(
+                "an answer is needed; Ctrl-C ends the command, and nothing is written"
+            )
+        if most is not None and len(words) > most:
+            raise click.UsageError(f"'{answer}' has {len(words)} words; give {most}")
+        for word in words:
+            check(word)
+        return words
+
+    words: tuple[str, ...]
+    words = click.prompt(question, default="", show_default=False, value_proc=valid)
+    return words
 
 
 @new.command()
@@ -107,18 +282,25 @@ def application(  # noqa: PLR0913 - as many as options
       demandops new application tracking
       demandops new application tracking --input camera=sensor_msgs/msg/Image
     """
-    given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
-    existing, config = _read_configuration(directory)
+    with busy("reading the state repo"):
+        with edited_checkout.opened(directory) as (_, tree):
+            existing = trees.texts(tree, CONFIG_ROOTS)
+        config = load(existing)
     # before the questions, so that nobody answers them in vain
-    scaffold.refuse_name(name, config)
+    if not _APPLICATION_NAME.fullmatch(name):
+        words = PATTERN_WORDS[_APPLICATION_NAME.pattern]
+        raise InvalidInput.at("NAME", f"{quoted(name)} cannot be used here; write {words}")
+    if name in config.appdefs or name in config.charts or name in config.images:
+        raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")
+    given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
     missing = [option for option, values in given.items() if not values]
     if missing and not sys.stdin.isatty():
         options = ", ".join(f"'{option}'" for option in missing)
         raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
     values = {option: given[option] or _asked(*_QUESTIONS[option]) for option in given}
-    planned_services = tuple(map(_service, values["--service"]))
-    planned_inputs = dict(map(_input, values["--input"]))
-    planned_image = _image(values["--image"][0])
+    planned = [_service(text) for text in values["--service"]]
+    types = dict(map(_input, values["--input"]))
+    pulled = _image(values["--image"][0])
     # a demand can name only nodes in an access domain
     nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
     if not (node or nodes):
@@ -126,217 +308,157 @@ def application(  # noqa: PLR0913 - as many as options
             "the inventory has no node in an access domain, so no demand can be made; add one "
             "first, in inventory/nodes.yaml"
         )
-    plan = ApplicationPlan(
-        name,
-        description or f"Runs {', '.join(service.name for service in planned_services)}",
-        planned_inputs,
-        planned_services,
-        planned_image,
-        node or nodes[0],
-    )
-    then = [
-        "when the files are on main, try the application: demandops request --dry-run "
-        f"{directory / 'appdefs' / name / 'demand.yaml'}"
-    ]
-    if domain := scaffold.closed_domain(plan, config):
-        then.insert(
-            0,
-            f"no rule of access domain '{domain.name}' allows demands for this application on "
-            f"{plan.node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
-            f"{config.file_of(DOMAINS_FILE, domain.name)}",
-        )
-    library, texts = new_repo.files_of_library(LIBRARY_FOLDER), _texts("application")
-    files = scaffold.application_files(plan, config, library, texts)
-    _lay_down(directory, existing, files, output, then)
-
-
-@new.command()
-@click.argument("name")
-@click.option("-m", "--reason", required=True, metavar="TEXT", help="Why the override is needed.")
-@click.option("--owner", required=True, metavar="NAME", help="Who is responsible.")
-@click.option(
-    "--service", "services", multiple=True, metavar="PATTERN", help="Select services by name."
-)
-@click.option(
-    "--application", "apps", multiple=True, metavar="PATTERN", help="Select applications by id."
-)
-@click.option("--node", "nodes", multiple=True, metavar="PATTERN", help="Select nodes by id.")
-@effect_options
-@_directory("The checked-out state repo.")
-@output_option
-def override(  # noqa: PLR0913 - as many as options
-    name: str,
-    *,
-    reason: str,
-    owner: str,
-    services: tuple[str, ...],
-    apps: tuple[str, ...],
-    nodes: tuple[str, ...],
-    hold: bool,
-    deny: bool,
-    keep: bool,
-    replicas: int | None,
-    directory: Path,
-    output: str,
-) -> None:
-    """Write a new override with one effect.
-
-    \b
-    Examples:
-      demandops new override calm --node edge --deny -m Works --owner petra
-    """
-    given = {"services": services, "applications": apps, "nodes": nodes}
-    select = {field: [*values] for field, values in given.items() if values}
-    if not select:
-        raise click.UsageError("say what the override selects: --service, --application or --node")
-    flags = {"hold": hold or None, "deny": deny or None, "keep": keep or None}
-    effects = {**flags, "replicas": replicas}
-    if sum(value is not None for value in effects.values()) != 1:
-        raise click.UsageError("give exactly one effect: --hold, --deny, --keep or --replicas")
-    existing, config = _read_configuration(directory)
-    if name in config.overrides:
-        raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
-    fields = {"reason": reason, "owner": owner, "select": [select], **effects}
-    note = "overrides/README.md lists all effects and selectors of overrides, and when they end."
-    files = {f"overrides/{name}.yaml": override_text(name, fields, note)}
-    _lay_down(directory, existing, files, output, [])
-
-
-@new.command()
-@click.argument("name")
-@click.option(
-    "--repository",
-    required=True,
-    metavar="HOST/PATH",
-    help="The image's repository in a container registry, such as ghcr.io/me/cam.",
-)
-@click.option(
-    "--state-repo",
-    "url",
-    required=True,
-    metavar="URL",
-    help="The state repo to which the image is proposed.",
-)
-@_directory("The repository of the ROS package.")
-@output_option
-def image(name: str, repository: str, url: str, directory: Path, output: str) -> None:
-    """Write a container file and pipelines for a ROS package of your own.
-
-    NAME is the image's name in registry/images/. The pipelines, for GitHub and GitLab, test the
-    package. When you push a tag, they also build the image and propose it, with its digest, to the
-    state repo.
-
-    \b
-    Examples:
-      demandops new image cam --repository ghcr.io/me/cam --state-repo git@host:f
-    """
-    then = ["keep .github/workflows/image.yml or .gitlab-ci.yml, whichever you need"]
-    files = scaffold.image_files(name, repository, url, _texts("image"))
-    _write_files(directory, files, output, then)
-
-
-def _texts(what: str) -> Files:
-    folder = data_folder("templates") / "scaffold" / what
-    return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
-
-
-def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
-    """Ask until the answer is at most ``most`` valid words; ``check`` raises for another word."""
-
-    def valid(answer: str) -> tuple[str, ...]:
-        if not (words := tuple(answer.split())):
-            raise click.UsageError(
-                "an answer is needed; Ctrl-C ends the command, and nothing is written"
-            )
-        if most is not None and len(words) > most:
-            raise click.UsageError(f"'{answer}' has {len(words)} words; give {most}")
-        for word in words:
-            check(word)
-        return words
-
-    words: tuple[str, ...]
-    words = click.prompt(question, default="", show_default=False, value_proc=valid)
-    return words
-
-
-def _input(text: str) -> tuple[str, str]:
-    if not (match := _INPUT.fullmatch(text)):
-        raise click.BadParameter(
-            f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image",
-            param_hint="--input",
-        )
-    if short := _SHORT_TYPE.fullmatch(match["type"]):
-        raise click.BadParameter(
-            f"'{text}' has no message type of ROS 2; write "
-            f"{match['role']}={short['package']}/msg/{short['name']}",
-            param_hint="--input",
-        )
-    return match["role"], match["type"]
-
-
-def _service(text: str) -> ServicePlan:
-    if not (match := _SERVICE.fullmatch(text)):
-        raise click.BadParameter(
-            f"'{text}' is not NAME=PACKAGE/FILE; write it like "
-            "detector=my_package/detector.launch.py",
-            param_hint="--service",
-        )
-    return ServicePlan(match["name"], match["package"], match["file"])
-
-
-def _image(text: str) -> Image:
-    try:
-        image = addresses.image(text)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--image") from None
-    if not (image.tag or image.digest):
-        raise click.BadParameter(
-            f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
-        )
-    return Image(repository=image.name, tag=image.tag or None, digest=image.digest or None)
-
-
-# Maps an option to the arguments of `_asked` that ask for the option's values.
-_QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
-    "--input": (
-        "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; separate several by spaces",
-        _input,
-        None,
-    ),
-    "--service": (
-        "Services, as name=package/file, such as detector=my_package/detector.launch.py; separate "
-        "several by spaces",
-        _service,
-        None,
-    ),
-    "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
-}
-
-
-def _read_configuration(directory: Path) -> tuple[Files, Config]:
-    with busy("reading the state repo"):
-        with edited_checkout.opened(directory) as (_, tree):
-            people = trees.texts(tree, CONFIG_ROOTS)
-        return people, load(people)
-
-
-def _lay_down(
-    directory: Path, existing: Files, new_files: Files, output: str, then: list[str]
-) -> None:
-    if strange := [path for path in new_files if ".." in path.split("/") or "//" in path]:
+    node = node or nodes[0]
+    description = description or f"Runs {', '.join(service.name for service in planned)}"
+    files = _application_files(name, description, types, planned, pulled, config)
+    path = f"appdefs/{name}/demand.yaml"
+    files[path], is_allowed = _example_demand(path, name, types, node, config)
+    if strange := [path for path in files if ".." in path.split("/") or "//" in path]:
         raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
     # nothing is written unless the whole configuration is valid with it
     with busy("rendering an example of each application"):
-        try_configuration(State(load({**existing, **new_files}), Ledger(), EVALUATE))
-    hints = [f"to check the files: demandops check {directory}", *then]
-    _write_files(directory, new_files, output, hints)
+        try_configuration(State(load({**existing, **files}), Ledger(), EVALUATE))
+    then = [f"to check the files: demandops check {directory}"]
+    if not is_allowed:
+        domain = config.domain_of[node]
+        then.append(
+            f"no rule of access domain '{domain.name}' allows demands for this application on "
+            f"{node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
+            f"{config.file_of(DOMAINS_FILE, domain.name)}"
+        )
+    then.append(
+        "when the files are on main, try the application: demandops request --dry-run "
+        f"{directory / path}"
+    )
+    _write_files(directory, files, output, then)
 
 
-def _write_files(directory: Path, files: Files, output: str, then: list[str]) -> None:
-    if there := [path for path in files if (directory / path).exists()]:
-        raise StateRepoError(f"{directory / there[0]} exists; move it away (nothing was changed)")
-    for path, text in files.items():
-        (directory / path).parent.mkdir(parents=True, exist_ok=True)
-        (directory / path).write_text(text, encoding="utf-8")
-    lines = [f"new: {directory / path}" for path in sorted(files)]
-    show(output, {"files": sorted(files)}, [*lines, *then])
+_APPLICATION_NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
+_RESULT = "result"
+_VERSION = "0.1.0"
+_LIBRARY_FOLDER = f"appdefs/charts/{charts.LIBRARY}"
+
+
+def _application_files(
+    name: str,
+    description: str,
+    types: Mapping[str, str],
+    services: list[_Service],
+    image: Image,
+    config: Config,
+) -> dict[str, str]:
+    root = f"appdefs/{name}"
+    chart = f"{root}/charts/{name}"
+    library, texts = new_repo.files_of_library(_LIBRARY_FOLDER), _templates("application")
+    has_library = f"{_LIBRARY_FOLDER}/Chart.yaml" in config.files
+    files, shared = ({}, config.files) if has_library else (library, library)
+    version = re.search(r"(?m)^version: (\S+)$", shared[f"{_LIBRARY_FOLDER}/Chart.yaml"])
+    given = {
+        "NAME": name,
+        "DESCRIPTION": description,
+        "PACKAGE": services[0].package,
+        "FILE": services[0].launch_file,
+        "REPOSITORY": image.repository,
+        "RESULT": _RESULT,
+        "VERSION": _VERSION,
+        "LIBRARY": charts.LIBRARY,
+        "LIBRARY_FOLDER": _LIBRARY_FOLDER,
+        "LIBRARY_VERSION": version[1] if version else _VERSION,
+        "EXPORT": charts.EXPORT,
+        "SERVICES": "",
+    }
+    # Names of releases begin with the prefix of their service, so each service needs its own.
+    taken = {kind.word for kind in CONNECTION_TYPES}
+    taken |= {service.prefix for own in config.services.values() for service in own.values()}
+    taken |= {definition.prefix for definition in config.definitions.values()}
+    inputs = {role: role for role in types}  # the origin of each input of the next service
+    definitions: dict[str, Any] = {}
+    for service in services:
+        letters = re.sub("[^a-z0-9]", "", service.name)[:8]
+        prefixes = (letters, *(f"{letters}{number}" for number in range(2, 100)))
+        prefix = next(word for word in prefixes if word not in taken)
+        taken.add(prefix)
+        definitions[service.name] = {
+            "prefix": prefix,
+            "inputs": inputs,
+            "outputs": {_RESULT: f"/{{instance}}_{service.role}"},
+            "chart": name,
+            "images": [name],
+            "values": f"values/{service.name}.yaml.j2",
+        }
+        given["SERVICES"] += (
+            f"| `{service.name}` | `ros2 launch {service.package} {service.launch_file}` "
+            f"| {', '.join(f'`{origin}`' for origin in inputs.values())} |\n"
+        )
+        topics = (f'    {role}_topics: {{{{ topics.{role} | join(",") }}}}\n' for role in inputs)
+        own = {"SERVICE": service.name, "PACKAGE": service.package, "FILE": service.launch_file}
+        own["TOPICS"] = "".join(topics)
+        files[f"{root}/values/{service.name}.yaml.j2"] = _filled(
+            texts["values.yaml.j2"], given | own
+        )
+        inputs = {service.role: f"{service.name}.{_RESULT}"}
+    fields = {
+        "name": name,
+        "description": description,
+        "inputs": {role: {"type": type} for role, type in types.items()},
+        "services": definitions,
+    }
+    note = (
+        "docs/appdef.md of DemandOps explains each field. To run a service once for each topic of\n"
+        "an input instead of once for each application, add `each: <input>` to it."
+    )
+    path = f"{root}/appdef.yaml"
+    files[path] = document(path, "application", "ApplicationDefinition", fields, note)
+    for path, template in (
+        (f"{root}/README.md", "readme"),
+        (f"{chart}/Chart.yaml", "chart.yaml"),
+        (f"{chart}/values.yaml", "chart-values.yaml"),
+        (f"{chart}/README.md", "chart-readme"),
+        (f"{chart}/templates/service.yaml", "service.yaml"),
+    ):
+        files[path] = _filled(texts[template], given)
+    schema = charts.composed(
+        f"Values of the chart {name}",
+        {"launch": json.loads(texts["launch.schema.json"])},
+        files[f"{chart}/values.yaml"],
+        json.loads(shared[f"{_LIBRARY_FOLDER}/values.schema.json"]),
+        shared[f"{_LIBRARY_FOLDER}/values.yaml"],
+    )
+    files[f"{chart}/values.schema.json"] = json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
+    for kind, content in (
+        ("charts", {"folder": chart, "version": _VERSION}),
+        ("images", image.model_dump(exclude_none=True)),
+    ):
+        path = f"registry/{kind}/{name}.yaml"
+        files[path] = document(path, kind, kind.title(), {kind: {name: content}})
+    return files
+
+
+def _example_demand(
+    path: str, name: str, types: Mapping[str, str], id: str, config: Config
+) -> tuple[str, bool]:
+    """Return the text of an example, and whether the rules of the node's domain allow it."""
+    node, domain = config.nodes.get(id), config.domain_of.get(id)
+    topics, rules = node.topics if node else {}, domain.rules if domain else ()
+    allowing = [
+        rule for rule in rules if matches(name, rule.applications) and matches(id, rule.nodes)
+    ]
+    # The requester matches a rule that allows the application. If there is none, it matches the
+    # first rule, and a person must widen the rules.
+    requester = "operator"
+    for rule in (allowing or rules)[:1]:
+        pattern = rule.requesters[0]
+        matching = next((each for each in sorted(config.nodes) if matches(each, (pattern,))), "")
+        if pattern.strip("*"):
+            requester = matching or pattern.replace("?", "1").replace("*", "")
+    inputs = {role: [{"topic": topics.get(role, f"/{role}"), "source": id}] for role in types}
+    fields = {
+        "demand": f"{name}-example",
+        "requesters": [requester],
+        "applications": [{"id": f"{id}/{name}", "type": name, "node": id, "inputs": inputs}],
+    }
+    note = (
+        f"An example: demandops request {path}\n"
+        "`requesters` lists who demands this, by names that the rules of the access domain allow."
+    )
+    return document(path, "demand", "Demand", fields, note), bool(allowing or not rules)

@@ -100,7 +100,7 @@ def approve(
       demandops approve visit -m "Agreed with the control room"
       demandops approve visit --commit 5d41402abc4b2a76b9719d911017c592e81f9d3a
     """
-    if not (commit or person_change.is_asked(yes, output)):
+    if not (commit or person_change.is_asked(yes)):
         raise click.UsageError(
             "name the commit that you looked at: --commit ID; `demandops get proposals` lists it"
         )
@@ -117,7 +117,7 @@ def approve(
                 *(f"~ file {path}" for path in by_hand),
             ):
                 errors.print(f"  {one_line(line)}")
-        person_change.confirm("Approve it?", yes, output)
+        person_change.confirm("Approve it?", yes or bool(commit))
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
         details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
         merged = person_commit.merge(repo.repository, proposal, details)
@@ -148,7 +148,7 @@ def reject(
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Reject a proposal: record that on main in your own name, and delete its branch.
+    """Reject a proposal: delete its branch, and record who and why.
 
     The requester gets the reason; the generator aborts the goal with `turned-down`. If the branch
     has changed since the command read it, the command changes nothing.
@@ -160,7 +160,7 @@ def reject(
     """
     with person_change.writable(state_repo, signing_key) as repo:
         proposal = _proposal(repo, name, commit, output)
-        person_change.confirm("Reject it?", yes, output)
+        person_change.confirm("Reject it?", yes or bool(commit))
         summary = f"Reject {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
         details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
         recorded = None

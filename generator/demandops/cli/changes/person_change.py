@@ -1,19 +1,45 @@
-"""Shared parts of the commands by which a person edits the state repo."""
+"""How a person changes a state repo: a command decides, shows what follows, asks, and acts.
+
+What a person configures is a commit in their own name, on main or on a branch to be merged
+(:func:`commit`). What they end or restore in the ledger is booked like a demand
+(:mod:`.ledger_change`).
+"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields
+from functools import wraps
 from pathlib import Path
+from typing import Any
 
 import click
 
-from demandops.cli.output import errors
+from demandops.base import settings
+from demandops.base.quoting import harmless, one_line
+from demandops.base.runtime import REAL
+from demandops.base.settings import MAIN_BRANCH
+from demandops.cli import json_output, target
+from demandops.cli.json_output import Json
+from demandops.cli.output import done, errors, fitted, progress, terminal_width
+from demandops.cli.queries.diff import release_lines
+from demandops.decide.changeset import ReleaseChange, describe_change, planned_releases
+from demandops.decide.planning.overrides import suspended_claims
+from demandops.decide.state import State
+from demandops.model.ledger.claim import requesters_of
+from demandops.model.release import claims_of
 from demandops.repo import reader
+from demandops.repo.forge import ForgeError, forge_for
 from demandops.repo.git.signing import Signer
 from demandops.repo.history.commit_log import Person
 from demandops.repo.reader import Reader
+from demandops.repo.write import person_commit
+from demandops.repo.write.person_commit import CommitDetails
+from demandops.serve.approvals.proposal import merge_request
+
+# ---- the options of all these commands ----
 
 reason_option = click.option(
     "-m",
@@ -22,16 +48,96 @@ reason_option = click.option(
     callback=lambda ctx, param, text: " ".join((text or "").split()),
     help="The reason. It is written to the commit message and to the file of a new override.",
 )
-yes_option = click.option("-y", "--yes", is_flag=True, help="Do not ask for confirmation.")
+yes_option = click.option(
+    "-y", "--yes", is_flag=True, help="Do not ask. Needed where there is no terminal."
+)
+propose_option = click.option(
+    "--propose",
+    is_flag=True,
+    help="Push a branch instead of committing to main. If demandops.yaml names a forge, also open "
+    "a merge request.",
+)
 
 
-def is_asked(yes: bool, output: str) -> bool:
-    return not yes and output == "text" and sys.stdin.isatty()
+@dataclass(frozen=True, slots=True)
+class Options:
+    state_repo: str
+    signing_key: Path | None
+    reason: str
+    dry_run: bool
+    yes: bool
+    output: str
+    propose: bool = False
+
+    def require_reason(self) -> None:
+        if not self.reason:
+            raise click.UsageError("give the reason: -m TEXT")
 
 
-def confirm(question: str, yes: bool, output: str) -> None:
-    if is_asked(yes, output) and not click.confirm(question, err=True):
+def changing(
+    *more: Callable[[target.Command], target.Command],
+) -> Callable[[target.Command], target.Command]:
+    # the command gets the values of these options as `options`
+    def add(command: target.Command) -> target.Command:
+        @wraps(command)
+        def run(**given: Any) -> Any:  # noqa: ANN401
+            names = [field.name for field in fields(Options) if field.name in given]
+            return command(options=Options(**{name: given.pop(name) for name in names}), **given)
+
+        return target.with_options(
+            reason_option,
+            *more,
+            target.dry_run_option,
+            yes_option,
+            target.writable_repo_option,
+            target.signing_option,
+            json_output.output_option,
+        )(run)
+
+    return add
+
+
+# ---- what follows, and the question ----
+
+_MOST_SHOWN = 30
+
+
+def is_asked(yes: bool) -> bool:
+    return not yes and sys.stdin.isatty()
+
+
+def confirm(question: str, yes: bool) -> None:
+    if not yes and not sys.stdin.isatty():
+        raise click.ClickException(
+            "nothing was changed, because nobody can be asked here; if you mean it, give --yes"
+        )
+    if not yes and not click.confirm(question, err=True):
         raise click.ClickException("nothing was changed")
+
+
+def count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def consequence(
+    releases: Collection[ReleaseChange], who: Collection[str], claims: Collection[object] = ()
+) -> Iterator[str]:
+    """Yield the lines about the releases that change, and in capitals what stops or is released.
+
+    ``claims`` are those that are released or reduced, ``who`` are their requesters, or those of the
+    releases that stop.
+    """
+    for line in release_lines([*releases][:_MOST_SHOWN]):
+        yield fitted(f"  {line}", terminal_width())
+    if len(releases) > _MOST_SHOWN:
+        yield f"  and {count(len(releases) - _MOST_SHOWN, 'more release')} (-o json lists all)"
+    stopped = sum(release.change == "stop" for release in releases)
+    verbs = [f"RELEASES {count(len(claims), 'claim')}"] if claims else []
+    verbs += [f"STOPS {count(stopped, 'release')}"] if stopped else []
+    if verbs:
+        yield f"{' and '.join(verbs)} of {count(len(who), 'requester')}"
+    elif not releases:
+        yield "  stops and changes nothing that runs"
 
 
 def warned_if_unnamed(person: Person) -> Person:
@@ -44,6 +150,9 @@ def warned_if_unnamed(person: Person) -> Person:
     return person
 
 
+# ---- a commit of a person ----
+
+
 @contextmanager
 def writable(
     state_repo: str, signing_key: Path | None, *, dry_run: bool = False
@@ -52,3 +161,81 @@ def writable(
     with reader.opened(state_repo, only_read=dry_run) as repo:
         repo.repository.signer = Signer(signing_key) if signing_key else None
         yield repo
+
+
+def commit(
+    repo: Reader,
+    files: Mapping[str, str | None],
+    summary: str,
+    branch: str,
+    options: Options,
+    more: Callable[[State, State], tuple[Json, Iterable[str]]] = lambda before, after: ({}, ()),
+) -> None:
+    """Commit files to main, or to ``branch``, once the person has seen what follows.
+
+    ``more`` returns further JSON and further lines about the state before and after.
+    """
+    with progress("reading the ledger") as report:
+        before = repo.snapshot(progress=report)
+        after = person_commit.state_after(repo.repository, before, files)
+    old, new = planned_releases(before.state), planned_releases(after)
+    changes = [
+        describe_change(old.get(key), new.get(key), key in old)
+        for key in {**old, **new}
+        if old.get(key) != new.get(key)
+    ]
+    changes.sort(key=lambda change: (change.change, change.name))
+    stopped = [release for key, release in old.items() if key not in new]
+    who = {name for r in stopped for name in requesters_of(claims_of(r, before.state.ledger))}
+    suspended = {claim.key for claim, _ in suspended_claims(before.state)}
+    claims = [claim for claim, _ in suspended_claims(after) if claim.key not in suspended]
+    of_command, lines = more(before.state, after)
+    told = [f"{summary} ({', '.join(files)})", *lines, *consequence(changes, who)]
+    data: Json = {
+        "outcome": "would-change",
+        "commit": None,
+        "branch": None,
+        "link": None,
+        "files": dict(files),
+        "releases": [asdict(change) for change in changes],
+        "claims": [json_output.claim_data(claim) for claim in claims],
+        **of_command,
+    }
+    if options.dry_run:
+        texts = (text for text in files.values() if text is not None and len(files) == 1)
+        shown = [f"    {line}" for text in texts for line in text.splitlines()]
+        json_output.show(options.output, data, [*told, *shown, "nothing was changed"])
+        return
+    for line in told if options.output == "text" else ():
+        errors.print(line)
+    confirm("Continue?", options.yes)
+    reason = one_line(options.reason)
+    person = warned_if_unnamed(repo.operator())
+    details = CommitDetails(person, REAL.now(), summary, reason)
+    if not options.propose:
+        published = person_commit.commit_to_main(repo.repository, files, details)
+        text = [
+            f"{summary}: commit {published.commit} on {MAIN_BRANCH}",
+            "a running generator carries out this commit, or else the next generator that starts",
+            *target.hint_to_pull(),
+        ]
+    else:
+        title = harmless(one_line(summary))
+        proposals = before.state.config.repo_settings.proposals
+        # only GitLab opens a merge request for a push
+        asked = merge_request(title, reason) if proposals.forge == "gitlab" else []
+        published = person_commit.commit_to_branch(repo.repository, files, details, branch, asked)
+        data["link"] = published.link or None
+        try:
+            if not published.link and (forge := forge_for(proposals, settings.forge_token_file())):
+                data["link"] = forge.open(branch, MAIN_BRANCH, title, reason).link
+        except ForgeError as error:  # the branch is there, so a person can open the merge request
+            errors.print(f"warning: no merge request was opened: {error}; open one for {branch}")
+        text = [f"{summary}: merge {branch} {data['link'] or ''}".rstrip()]
+    done.append(f"commit {published.commit} on {published.branch}")
+    data |= {
+        "outcome": "proposed" if options.propose else "committed",
+        "commit": published.commit,
+        "branch": published.branch,
+    }
+    json_output.show(options.output, data, text)

@@ -12,6 +12,7 @@ import click
 from demandops.base import strict_yaml
 from demandops.base.errors import (
     DemandOpsError,
+    Fault,
     InvalidInput,
     ShuttingDown,
     Unsound,
@@ -25,6 +26,7 @@ from demandops.cli.changes import ledger_change
 from demandops.cli.changes.ledger_change import started_generator
 from demandops.cli.json_output import Json, faults_of, output_option, print_json
 from demandops.cli.output import console, done, errors, progress
+from demandops.cli.queries.diff import release_lines
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
 from demandops.decide.decision import decide
 from demandops.model.demand.goals import form_faults, is_demand_goal
@@ -252,7 +254,11 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
                 console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
                 for rule in decision.approval:
                     console().print(f"  needs approval: {rule} requires it")
-                ledger_change.print_consequences(decision)
+                lines = [*release_lines(decision.releases)]
+                for path, text in sorted(decision.files.items()):
+                    lines.append(f"{'remove' if text is None else 'write '} {path}")
+                for line in lines:
+                    console().print(f"  {line}", soft_wrap=True)
             more: Json = {
                 "warnings": decision.warnings,
                 "not_held": decision.changes.not_held,
@@ -272,7 +278,9 @@ def _print_rows(rows: list[Json], documents: list[Document], dry_run: bool) -> N
         if not dry_run and _is_unanswered(row):
             errors.print(f"{title} has no answer yet")
         elif row["outcome"] == "refused":
-            ledger_change.print_refusal(f"{title} refused", row["faults"])
+            errors.print(f"{title} refused")
+            for each in row["faults"]:
+                errors.print(f"  {Fault(**each)}")
         elif not dry_run:
             told, proposal = f"{row['outcome']} in {row['commit']}", row.get("proposal")
             if proposal is not None:

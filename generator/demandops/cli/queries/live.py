@@ -132,7 +132,7 @@ def web(state_repo: str, listen: str, access_file: Path | None, interval: float)
     """Show the state repo on a web page.
 
     The page follows the state repo. It shows what is not ready and why, a map, lists, a time line,
-    each release, overrides and rates. It changes nothing. Stop it with Ctrl-C or SIGTERM.
+    each release, and overrides. It changes nothing. Stop it with Ctrl-C or SIGTERM.
 
     \b
     Examples:

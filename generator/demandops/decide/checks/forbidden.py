@@ -29,19 +29,21 @@ from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Changes, ClaimChange, World
 from demandops.model.release import Release, ServiceKey, ServiceRelease
 
-# ---- denials: a demand is refused if an override with ``deny`` selects what it asks for ----
+# ---- denials: a demand is refused if an override selects what it asks for ----
 #
-# Such an override suspends existing claims that it selects. A demand that only repeats them is not
-# refused; its requester gets a warning.
+# One with ``deny`` suspends existing claims that it selects. A demand that only repeats them is not
+# refused; its requester gets a warning. One with ``refuseNew`` leaves existing claims alone, and
+# lets them become smaller.
 
 
 def denial_faults(request: Demand, after: World, changes: Changes) -> Iterator[Fault]:
-    denying = [override for override in reversed(after.overrides) if override.deny]
-    if not denying or not request.adds_claims:
+    refusing = [each for each in reversed(after.overrides) if each.deny or each.refuseNew]
+    if not refusing or not request.adds_claims:
         return
-    renewed = {change.key.subject: change.only_renews for change in changes.claims}
+    changed = {change.key.subject for change in changes.claims if not change.only_renews}
+    wider = {change.key.subject for change in changes.claims if not change.only_narrows}
     for item in request.demanded:
-        if renewed.get(item.held.subject, True):
+        if item.held.subject not in changed:
             continue
         # A selector that names services is compared with each service of the application, because
         # a service may run on another node than the application. Any other is compared with the
@@ -55,7 +57,8 @@ def denial_faults(request: Demand, after: World, changes: Changes) -> Iterator[F
             ]
         matching = (
             (override, selector)
-            for override in denying
+            for override in refusing
+            if override.deny or item.held.subject in wider
             for selector in override.select
             for traits in (services if selector.services else [demanded])
             if fits(selector, traits, after.config)
@@ -68,8 +71,9 @@ def denial_faults(request: Demand, after: World, changes: Changes) -> Iterator[F
                 what = f" of connection '{route.listed}'" if route.listed else ""
                 topic = item.held.key_of(route).topic
                 carried = f"{topic}{what} is carried by connection '{item.held.id}', which "
+            how = "is denied" if override.deny else "is new, and refused"
             message = (
-                f"{carried}is denied by {override.path}{until}: {override.reason}; ask the "
+                f"{carried}{how} by {override.path}{until}: {override.reason}; ask the "
                 f"override's owner, {override.owner}, or demand something else"
             )
             yield item.fault(_matched_field(selector, item, after.config), message, code="denied")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from functools import lru_cache
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -28,6 +28,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path, suggestion
 from demandops.base.naming import PATTERN_WORDS, control_character, one_form
 from demandops.base.quoting import quoted
+from demandops.base.settings import API_VERSION, modeline
 
 # ---- durations and times for people: ``1h30m``, ``in 10m``, ``3m20s ago`` ----
 
@@ -313,3 +314,10 @@ def parse_file(model: type[Model], text: str, file: str) -> Model:
             message += f" that starts with apiVersion: {get_args(version.annotation)[-1]}"
         raise InvalidInput.at("", message, file=file)
     return parse(model, data, file)
+
+
+def document(path: str, schema: str, kind: str, fields: Mapping[str, Any], note: str = "") -> str:
+    """Return the text of a file that people edit."""
+    text = strict_yaml.dump({"apiVersion": API_VERSION, "kind": kind, **fields})
+    comment = "".join(f"# {line}\n" for line in note.splitlines())
+    return modeline(path, schema) + comment + text

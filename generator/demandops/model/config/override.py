@@ -37,7 +37,7 @@ OVERRIDES_ROOT = "overrides"
 _SHAPING = ("values", "version", "images", "replicas", "node")
 _OF_SERVICES = ("version", "replicas", "node")
 # The effects of overrides, in the order in which messages list them
-EFFECTS = (*_SHAPING, "hold", "deny", "keep")
+EFFECTS = (*_SHAPING, "hold", "deny", "refuseNew", "keep")
 
 
 def format_time(moment: datetime) -> str:
@@ -127,6 +127,8 @@ class OverrideFile(FileModel):
     node: NodeId | None = None
     hold: Literal[True] | None = None
     deny: Literal[True] | None = None
+    # Refuses what is new; what runs stays, and may be renewed and released
+    refuseNew: Literal[True] | None = None
     keep: Literal[True] | None = None
 
     @model_validator(mode="after")

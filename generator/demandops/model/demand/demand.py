@@ -535,14 +535,24 @@ AnyDemand = TypeVar("AnyDemand", bound=Demand)
 
 @dataclass(frozen=True, slots=True)
 class Decommission(Demand):
-    """An operator's request to release all that needs the node, or names the requester, ``id``."""
+    """A person's request to release all that needs the node ``id``, names the requester ``id``, is
+    held by the demand ``id``, or is claimed on the application ``id``.
+    """
 
     operation: Operation = "decommission"
-    kinds: frozenset[str] = frozenset()  # `node`, `requester` or both
+    kinds: frozenset[str] = frozenset()  # some of `DECOMMISSIONED`
     by: str = ""  # the operator as `name <email>`
     reason: str = ""
     # one name for each access domain of the node; the decision fills them in
     nodes: tuple[str, ...] = ()
+
+    @property
+    def verb(self) -> str:
+        # a demand or an application is released; a node or a requester leaves for good
+        return "decommission" if {"node", "requester"} & self.kinds else "release"
+
+
+DECOMMISSIONED = ("node", "requester", "demand", "application")
 
 
 @dataclass(frozen=True, slots=True)
@@ -550,12 +560,14 @@ class Rollback(Demand):
     """A person's request to book again the claims of the commit ``to``.
 
     It is carried out on the newest tip, so it works while others write. What they book until then
-    counts as newer than the commit.
+    counts as newer than the commit. With ``demand``, only its claims change. With ``application``,
+    only the claims on it, and the connections of the demands that hold or held it.
     """
 
     operation: Operation = "rollback"
     to: str = ""
     drop_newer: bool = False  # without it, newer claims make the rollback fail
+    application: str = ""
     reason: str = ""
     by: str = ""
     email: str = ""

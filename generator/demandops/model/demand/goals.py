@@ -26,6 +26,7 @@ from demandops.model.config.base_model import GOAL, FrozenModel, Items, faults_o
 from demandops.model.config.inventory import Coordinate, Position
 from demandops.model.config.repo_settings import ROOT_FILE, Limits
 from demandops.model.demand.demand import (
+    DECOMMISSIONED,
     Application,
     Decommission,
     Demand,
@@ -401,8 +402,11 @@ def decommission(name: str, kinds: frozenset[str], by: str, reason: str) -> Deco
     return read_journaled(goal | ({"reason": reason} if reason else {}))  # type: ignore[return-value]
 
 
-def rollback(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> Rollback:
-    goal = {"kind": "Rollback", "to": to, "dropNewer": drop_newer, "by": list(who)}
+def rollback(
+    to: str, *, drop_newer: bool, reason: str, who: tuple[str, str], **only: str
+) -> Rollback:
+    # ``only`` names a `demand` or an `application`
+    goal = {"kind": "Rollback", "to": to, "dropNewer": drop_newer, "by": list(who), **only}
     return read_journaled(goal | {"reason": " ".join(reason.split())})  # type: ignore[return-value]
 
 
@@ -413,7 +417,7 @@ def read_journaled(goal: Any) -> Demand:  # noqa: ANN401 - plain data
         problem = id_problem(name) if isinstance(name, str) else "must be text"
         if problem:
             raise Refused.at("name", problem)
-        kinds = frozenset(kind for kind in goal.get("as", ()) if kind in ("node", "requester"))
+        kinds = frozenset(kind for kind in goal.get("as", ()) if kind in DECOMMISSIONED)
         by, reason = (str(goal.get(key) or "") for key in ("by", "reason"))
         return Decommission(id=str(name), kinds=kinds, by=by, reason=reason, goal=goal)
     if kind == "Rollback":
@@ -422,6 +426,8 @@ def read_journaled(goal: Any) -> Demand:  # noqa: ANN401 - plain data
             to=str(goal["to"]),
             drop_newer=bool(goal["dropNewer"]),
             reason=str(goal["reason"]),
+            demand=str(goal.get("demand", "")),
+            application=str(goal.get("application", "")),
             by=by,
             email=email,
             goal=goal,

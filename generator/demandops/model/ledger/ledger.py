@@ -253,6 +253,17 @@ class ClaimChange:
         before, after = self.before, self.after
         return bool(before and after and replace(after, lease=before.lease) == before)
 
+    @property
+    def only_narrows(self) -> bool:
+        # at most topics are given up, and the lease changed
+        before, after = self.before, self.after
+        if before is None or after is None:
+            return after is None
+        left = before.without_topics({*before.held.topic_keys()} - {*after.held.topic_keys()})
+        return left is not None and left == replace(
+            after, lease=left.lease, booked=left.booked, request=left.request
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Changes:

@@ -168,7 +168,7 @@ def of_decision(
     keys = [change.key for change in claims]
     demands = dict.fromkeys((*(key.demand for key in keys), *decision.changes.waiting))
     trailers = [
-        ("Operation", request.operation),
+        ("Operation", request.verb if isinstance(request, Decommission) else request.operation),
         ("Operation-Id", operation),
         *more,
         *of_operation,
@@ -220,9 +220,13 @@ def _told(
     time = time_text(received)
     if isinstance(request, Restoration):
         to = request.to[:12]
-        why = f"{request.by} rolled the ledger back to commit {to}, which changes {what}: "
+        only = f"demand '{request.demand}'" if request.demand else ""
+        only = f"application '{request.application}'" if request.application else only
+        rolled = only or "the ledger"
+        why = f"{request.by} rolled {rolled} back to commit {to}, which changes {what}: "
         trailers = [("Restores", request.to), ("Reason", request.reason)]
-        return f"Roll back to {to}", why + request.reason, trailers
+        title = " ".join(filter(None, ("Roll", only and rolled, "back to", to)))
+        return title, why + request.reason, trailers
     if request.operation == "expire":
         claims = [change.before for change in changes]
         last = max(claim.lease.expires_at for claim in claims if claim and claim.lease)
@@ -236,11 +240,13 @@ def _told(
         by = f" by {request.by}" if request.by else ""
         reason = f" ({request.reason})" if request.reason else ""
         held = f"it held a part of {what_of_whom}" if changes else "its demands waited for room"
-        why = f"'{request.id}' was decommissioned{by} on {time}{reason}; {held}."
+        done = "released" if request.verb == "release" else "decommissioned"
+        why = f"'{request.id}' was {done}{by} on {time}{reason}; {held}."
         nodes, claims = request.nodes or (request.id,), [change.before for change in changes]
         needed = any(claim.held.needs(node) for claim in claims if claim for node in nodes)
         trailers = [("Node", request.id)] if needed and "node" in request.kinds else []
-        return f"Decommission {request.id}", why, [*trailers, ("Reason", request.reason)]
+        trailers = [*trailers, ("Reason", request.reason)]
+        return f"{request.verb.capitalize()} {request.id}", why, trailers
     if isinstance(request, Wait):
         who, reasons = ", ".join(request.requesters()), "; ".join(request.reasons)
         why = f"request '{request.id}' of demand '{request.demand}' in the name of {who}, received "

@@ -108,6 +108,8 @@ def restoration(repo: Repository, rollback: Rollback) -> Restoration:
         made=commit_log.time_of(commit),
         claims=tuple(claims),
         drop_newer=rollback.drop_newer,
+        demand=rollback.demand,
+        application=rollback.application,
         reason=rollback.reason,
         by=rollback.by,
         email=rollback.email,

@@ -16,13 +16,17 @@ from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
+from demandops.base.strict_yaml import with_lines
+from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.repo.git import tree as trees
+from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.repository import MAIN, StateRepository
 from demandops.repo.history import commit_message
 from demandops.repo.history.commit_log import Person
 from demandops.repo.history.commit_message import compose
 from demandops.repo.load import snapshot as snapshots
+from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.proposal_branch import PendingProposal, ProposalBranches
 
 _ATTEMPTS = 5
@@ -187,6 +191,24 @@ def _commit(
         if changes_config:
             raise
     return repository.new.add_commit(repository.signer, (who, who), text, tree, parents)
+
+
+def state_after(repository: StateRepository, before: Snapshot, files: Files) -> State:
+    """Return what would be in effect after a commit of these files, which nobody makes.
+
+    InvalidInput is raised if their configuration would not be valid, and StateRepoError if that of
+    ``before`` is not.
+    """
+    objects = repository.reopened()  # it gets the commit in memory
+    new, tip = NewObjects(objects), trees.commit_of(objects, before.commit)
+    _require_valid(repository, tip)
+    who = commit_message.signature("A person", "person@demandops.invalid", REAL.now())
+    tree = new.add_tree(tip.tree, files)
+    commit = new.add_commit(None, (who, who), "", tree, [tip.id])
+    after = snapshots.follow(objects, before, commit, REAL.now()).snapshot
+    if after.faults:
+        raise InvalidInput(with_lines(after.faults, files.get))
+    return after.state
 
 
 def _require_valid(repository: StateRepository, tip: Commit) -> None:

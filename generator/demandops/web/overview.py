@@ -1,0 +1,91 @@
+"""The figures of the overview: what runs, for whom, what waits, and what changed of late."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from itertools import groupby
+
+from demandops.views.source import Source
+from demandops.web.lists import Filter, Part, Row, exactly, rows_of
+from demandops.web.time_line import BOOKED, RELEASED, Event
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A number and what it counts, which links to a list; and what stands out of that list."""
+
+    count: int
+    what: Part
+    parts: Sequence[tuple[Part, str]] = ()  # each with its color
+
+
+def figures(source: Source, wanted: Filter, events: Iterable[Event], now: datetime) -> list[Figure]:
+    """Return the figures of what the filter finds; ``events`` are those that it finds, ever."""
+
+    def matching(name: str) -> list[Row]:
+        return [row for row in rows_of(source, name) if wanted.matches(row)]
+
+    def of_list(rows: list[Row], what: str, view: str) -> Figure:
+        cells = [row.cells["health"] for row in rows]
+        counts = Counter((cell.rank, cell.parts[0].text, cell.tone) for cell in cells)
+        words = [
+            (Part(f"{count} {word}", view, {"q": exactly("health", word)}), tone)
+            for (_, word, tone), count in sorted(counts.items())
+        ]
+        return Figure(len(rows), Part(_counted(len(rows), what), view), words)
+
+    services, connections, demands = map(matching, ("services", "connections", "demands"))
+    requesters = {part.text for row in demands for part in row.cells["requester"].parts}
+    nodes = {id for row in demands for id in row.hidden["node"]} & source.config.nodes.keys()
+    waiting = [row for row in demands if row.cells["health"].parts[0].text == "waits for room"]
+    waits = [
+        (count, (Part(f"{count} for {what}", view, params), "busy"))
+        for count, what, view, params in (
+            (len(source.proposals), "approval", "overrides", {}),
+            (len(waiting), "room", "demands", {"q": exactly("health", "waits for room")}),
+        )
+        if count
+    ]
+    last_day = [event for event in events if now - timedelta(days=1) <= event.time <= now]
+    last_hour = [event for event in last_day if event.time >= now - timedelta(hours=1)]
+
+    def rate(some: list[Event], span: str) -> tuple[Part, str]:
+        booked, released = (sum(e.word in words for e in some) for words in (BOOKED, RELEASED))
+        return Part(f"{booked} booked, {released} released in the last {span}"), ""
+
+    return [
+        of_list(services, "service", "services"),
+        of_list(connections, "connection", "connections"),
+        of_list(demands, "demand", "demands"),
+        Figure(
+            len(requesters),
+            Part(_counted(len(requesters), "requester"), "demands", {"sort": "requester"}),
+        ),
+        Figure(len(nodes), Part(f"of {len(source.config.nodes)} nodes used", "map")),
+        Figure(
+            sum(count for count, _ in waits),
+            Part("waiting", "overrides"),
+            [part for _, part in waits],
+        ),
+        Figure(
+            len(last_hour),
+            Part(
+                f"{_counted(len(last_hour), 'change')} in the last hour", "timeline", {"span": "1h"}
+            ),
+            [rate(last_hour, "hour"), rate(last_day, "day")],
+        ),
+    ]
+
+
+def _counted(count: int, word: str) -> str:
+    return word if count == 1 else f"{word}s"
+
+
+def newest(events: Sequence[Event]) -> Iterator[tuple[Event, int]]:
+    """Yield events, with how many releases have the same change of health after one another."""
+    for _, same in groupby(events, lambda event: event.commit or (event.summary, event.tone)):
+        group = [*same]
+        yield group[0], len(group)
