@@ -39,7 +39,7 @@ COMMANDS = {
         "Watch topics, and send the demands that rules ask for.",
     ),
     "diff": ("queries.diff", "Show the differences between two commits."),
-    "get": ("queries.get", "List demands, nodes, services, overrides and so on."),
+    "get": ("queries.get", "List demands, releases, nodes, overrides and so on."),
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
     "log": ("queries.log", "List the commits of the state repo, newest first."),
