@@ -38,6 +38,7 @@ COMMANDS = {
         "Watch topics, and send the demands that rules ask for.",
     ),
     "diff": ("queries.diff", "Show the differences between two commits."),
+    "drain": ("changes.edit", "Take a node out of use: nothing new is placed there."),
     "get": ("queries.get", "List demands, nodes, services, overrides and so on."),
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
@@ -55,6 +56,7 @@ COMMANDS = {
     "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),
     "request": ("changes.request", "Book demand requests from files."),
     "resume": ("changes.override", "Run suspended applications and connections again."),
+    "revert": ("changes.edit", "Undo a person's commit, by a new commit."),
     "rollback": (
         "changes.ledger_change",
         "Restore the claims of an earlier commit, by a new commit.",
@@ -63,6 +65,7 @@ COMMANDS = {
     "serve": ("demandops_ros.serve_command", "Run the ROS 2 node that accepts demands."),
     "status": ("queries.status", "Show the state of each release on its cluster."),
     "suspend": ("changes.override", "Stop applications and connections; their claims stay booked."),
+    "undrain": ("changes.edit", "Use a drained node again."),
     "upgrade": ("state_repo", "Render everything again, in one commit."),
     "verify": ("state_repo", "Render commits again from their ledger and compare the bytes."),
     "version": ("program", "Print the versions of the program and of its formats."),

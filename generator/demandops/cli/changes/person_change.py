@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from functools import wraps
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 import click
 
 from demandops.base import settings
+from demandops.base.errors import InvalidInput
 from demandops.base.quoting import harmless, one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
@@ -29,7 +30,8 @@ from demandops.decide.changeset import ReleaseChange, describe_change, planned_r
 from demandops.decide.planning.overrides import suspended_claims
 from demandops.decide.state import State
 from demandops.model.ledger.claim import requesters_of
-from demandops.model.release import claims_of
+from demandops.model.release import Release, claims_of
+from demandops.render import gitops
 from demandops.repo import reader
 from demandops.repo.forge import ForgeError, forge_for
 from demandops.repo.git.signing import Signer
@@ -153,6 +155,12 @@ def warned_if_unnamed(person: Person) -> Person:
 # ---- a commit of a person ----
 
 
+def _text(release: Release | None, state: State) -> object:
+    with suppress(InvalidInput):
+        return release and gitops.render(release, state.config, state.evaluate)
+    return None
+
+
 @contextmanager
 def writable(
     state_repo: str, signing_key: Path | None, *, dry_run: bool = False
@@ -179,11 +187,15 @@ def commit(
         before = repo.snapshot(progress=report)
         after = person_commit.state_after(repo.repository, before, files)
     old, new = planned_releases(before.state), planned_releases(after)
-    changes = [
-        describe_change(old.get(key), new.get(key), key in old)
-        for key in {**old, **new}
-        if old.get(key) != new.get(key)
-    ]
+    changes = []
+    for key in {**old, **new}:
+        was, now = old.get(key), new.get(key)
+        change = describe_change(was, now, key in old)
+        # a release also has what no file shows, such as whether its node is drained
+        if change.change != "change" or (
+            was != now and (change.details or _text(was, before.state) != _text(now, after))
+        ):
+            changes.append(change)
     changes.sort(key=lambda change: (change.change, change.name))
     stopped = [release for key, release in old.items() if key not in new]
     who = {name for r in stopped for name in requesters_of(claims_of(r, before.state.ledger))}
