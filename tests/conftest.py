@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 
 import pytest
-from demandops.repo.merge_check.helm import HELM_BIN
+from demandops.repo.merge_check.rendered_charts import HELM_BIN
 from demandops.serve.generator import Generator
 from hypothesis import HealthCheck, settings
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import pygit2
 import pytest
 from demandops.cli.main import run
-from demandops.repo.merge_check.helm import HELM_BIN
+from demandops.repo.merge_check.rendered_charts import HELM_BIN
 from hypothesis import given
 from hypothesis import strategies as st
 

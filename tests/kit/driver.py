@@ -29,7 +29,7 @@ from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.git.repository import StateRepository
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.proposal_branch import ProposalBranches
-from demandops.serve import worker
+from demandops.serve import agenda
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Journal, Receipt, Ticket
 
@@ -156,7 +156,7 @@ def tell_answer(name: str, future: Future[Receipt]) -> None:
 
 def run(plan: dict[str, Any]) -> None:
     sync.force(plan["synced"])
-    worker.LONGEST_EVALUATION_S = 60.0  # so that no slow machine publishes a batch in two parts
+    agenda.LONGEST_EVALUATION_S = 60.0  # so that no slow machine publishes a batch in two parts
     arm(plan["die_at"], plan["address"])
     generator = Generator(plan["address"])
     tell(ready=os.getpid())

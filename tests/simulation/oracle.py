@@ -325,7 +325,7 @@ class Oracle:
         """Fail if a restarted machine lost a demand; watch the answers to those that it resumed."""
         self._last.pop(machine, None)
         assert machine.generator is not None
-        tickets = machine.generator._demands._tickets
+        tickets = machine.generator._demands._journal.pending
         for operation, asked in self.asked.items():
             if asked.machine is not machine or asked.is_answered or asked.is_lost:
                 continue
@@ -350,7 +350,7 @@ class Oracle:
         assert not left, f"not answered: {left}"
         for machine in self.world.machines:
             assert machine.generator is not None
-            assert machine.generator._demands._tickets == {}, "the journal has demands"
+            assert machine.generator._demands._journal.pending == {}, "the journal has demands"
             snapshot = machine.generator.snapshot
             assert str(snapshot.commit) == tip, f"{machine.name} is behind"
             known = claims_of(snapshot.state.ledger)

@@ -92,8 +92,6 @@ _TAGS = {
     yaml.SequenceStartEvent: (None, "!", f"{_TAG}seq"),
     yaml.MappingStartEvent: (None, "!", f"{_TAG}map"),
 }
-# Takes the place of a list of texts in the text that PyYAML reads (`_only_document`)
-_LIST = "!demandops-list"
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
@@ -102,10 +100,6 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 class Loader(_CLoader):  # type: ignore[misc]
     """Builds the values of a text in one pass over libyaml's events."""
-
-    def __init__(self, text: str, lists: Iterable[list[str]] = ()) -> None:
-        super().__init__(text)
-        self._lists = iter(lists)
 
     def documents(self, most: float = math.inf) -> Iterator[Any]:
         while not isinstance(event := self.get_event(), yaml.StreamEndEvent):
@@ -127,11 +121,9 @@ class Loader(_CLoader):  # type: ignore[misc]
             message = "anchors and aliases (& and *) are not allowed; write the value out"
             raise InvalidInput.at(where, message)
         if event.tag not in _TAGS[kind]:
-            is_list = event.tag == _LIST and getattr(event, "value", None) == ""
-            if is_list and depth <= MAX_DEPTH and (found := next(self._lists, None)):
-                return found
-            shown = short_repr(event.tag)
-            raise _problem(f"the tag {shown} is not allowed; write plain data", event)
+            raise _problem(
+                f"the tag {short_repr(event.tag)} is not allowed; write plain data", event
+            )
         if kind is yaml.ScalarEvent:
             if event.tag or not event.implicit[0]:
                 return event.value
@@ -193,12 +185,6 @@ def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]
         raise InvalidInput(faults_in(error, file)) from None
 
 
-# Matches a field with a list of plain texts, as `to_json` writes it. The json module reads a list
-# of at least so many characters, 20 times as fast as PyYAML.
-_LISTED = re.compile(
-    r'^( *[A-Za-z][\w-]*: )(\["(?=.{200})[ !#-\[\]-~]*"(?:, "[ !#-\[\]-~]*")*\])$', re.MULTILINE
-)
-
 # How many characters a text may have for its value to be cached
 _MOST_CACHED = 10_000
 
@@ -220,19 +206,6 @@ def _document_as_bytes(text: str) -> bytes:
 
 
 def _only_document(text: str) -> Any:  # noqa: ANN401
-    lists: list[list[str]] = []
-
-    def taken_out(match: re.Match[str]) -> str:
-        lists.append(json.loads(match[2]))
-        return match[1] + _LIST
-
-    if len(text) <= MAX_LENGTH and _LIST not in text:
-        rest, left = _LISTED.sub(taken_out, text), iter(lists)
-        # if a list is inside a text, say, the text is read as it is, so that a fault has its line
-        with suppress(yaml.YAMLError, InvalidInput, ValueError):
-            value = Loader(rest, left).get_single_data() if lists else None
-            if value is not None and next(left, None) is None:
-                return value
     documents = [*load_all(text, most=1)]
     return documents[0] if documents else None
 

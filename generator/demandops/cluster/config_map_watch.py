@@ -11,12 +11,9 @@ from demandops.base.errors import InvalidInput
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.cluster.clusters_file import ClusterAccess, own_cluster_api
+from demandops.cluster.object_cache import CONNECT_S, WATCH_S, keep_watching
 
 log = logging.getLogger("demandops")
-
-_WATCH_S = 240
-_CONNECT_S = 5
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 _GONE = "is gone; its last data stay valid"
 
@@ -57,45 +54,34 @@ class ConfigMapWatch:
             self._closed.set()
 
     def _run(self) -> None:
-        pause = _FIRST_PAUSE_S
-        while not self._closed.is_set():
-            try:
-                from kubernetes import client, watch  # noqa: PLC0415 - slow (half a second)
+        from kubernetes import client  # noqa: PLC0415 - slow (half a second), so only on use
 
-                read = client.CoreV1Api(self._client).list_namespaced_config_map
-                listed = read(**self._request, _request_timeout=(_CONNECT_S, _WATCH_S))
-                for item in listed.items:
-                    self._take(item)
-                if not listed.items:
-                    is_new = self._data is None
-                    self._tell("does not exist yet" if is_new else _GONE)
-                for event in watch.Watch().stream(
-                    read,
-                    **self._request,
-                    resource_version=listed.metadata.resource_version,
-                    timeout_seconds=_WATCH_S,
-                    _request_timeout=(_CONNECT_S, _WATCH_S + 30),
-                ):
-                    if self._closed.is_set():
-                        return
-                    if event["type"] in ("ADDED", "MODIFIED"):
-                        self._take(event["object"])
-                    elif event["type"] == "DELETED":
-                        self._tell(_GONE)
-                pause = _FIRST_PAUSE_S
-            except Exception as error:  # the library raises errors of many kinds
-                reason = getattr(error, "reason", None) or error or type(error).__name__
-                self._tell(f"cannot be read: {one_line(str(reason))[:300]}; retrying")
-                self._closed.wait(pause)
-                pause = min(pause * 2, _LONGEST_PAUSE_S)
+        api = client.CoreV1Api(self._client).list_namespaced_config_map
 
-    def _take(self, item: Any) -> None:  # noqa: ANN401 - the library has no types
-        self._told = ""  # so that the next failure is logged again
-        data = dict(item.data or {})
-        with self._calling:
-            if data != self._data and not self._closed.is_set():
-                self._data = data
-                self._on_data(data)
+        def read() -> str:
+            listed = api(**self._request, _request_timeout=(CONNECT_S, WATCH_S))
+            for item in listed.items:
+                take("ADDED", item)
+            if not listed.items:
+                self._tell("does not exist yet" if self._data is None else _GONE)
+            return str(listed.metadata.resource_version)
+
+        def take(change: str, item: Any) -> None:  # noqa: ANN401 - the library has no types
+            if change == "DELETED":
+                self._tell(_GONE)
+                return
+            self._told = ""  # so that the next failure is logged again
+            data = dict(item.data or {})
+            with self._calling:
+                if data != self._data and not self._closed.is_set():
+                    self._data = data
+                    self._on_data(data)
+
+        def tell(error: Exception) -> None:
+            reason = getattr(error, "reason", None) or error or type(error).__name__
+            self._tell(f"cannot be read: {one_line(str(reason))[:300]}; retrying")
+
+        keep_watching(lambda: api, self._request, read, take, tell, self._closed)
 
     def _tell(self, text: str) -> None:
         with self._calling:

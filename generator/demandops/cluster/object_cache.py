@@ -13,16 +13,19 @@ from demandops.cluster.health import ClusterDomain, Health, Key, ObjectSelector,
 
 log = logging.getLogger("demandops")
 
-_KINDS = {
+_APIS = {
     "Kustomization": ("kustomize.toolkit.fluxcd.io", "v1", "kustomizations"),
     "GitRepository": ("source.toolkit.fluxcd.io", "v1", "gitrepositories"),
     "HelmRelease": ("helm.toolkit.fluxcd.io", "v2", "helmreleases"),
     "Application": ("argoproj.io", "v1alpha1", "applications"),
     "Deployment": ("apps", "v1", "deployments"),
 }
+_KINDS = {
+    kind: dict(zip(("group", "version", "plural"), api, strict=True)) for kind, api in _APIS.items()
+}
 # A watch ends by itself and begins again: one whose connection died without a sign would never end.
-_WATCH_S = 240
-_CONNECT_S = 5
+WATCH_S = 240
+CONNECT_S = 5
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 
@@ -107,48 +110,53 @@ class ObjectCache:
         listed = client.CoreV1Api(self._api().api_client).list_namespaced_pod(
             namespace,
             label_selector=",".join(f"{key}={value}" for key, value in labels.items()),
-            _request_timeout=(_CONNECT_S, _CONNECT_S),
+            _request_timeout=(CONNECT_S, CONNECT_S),
         )
         return list(listed.items)
 
     def close(self) -> None:
         self._closed.set()
 
-    def _keep_watching(self, selector: ObjectSelector) -> None:
-        pause = _FIRST_PAUSE_S
-        while not self._closed.is_set():
-            try:
-                from kubernetes import watch  # noqa: PLC0415 - slow (half a second), so only on use
+    def annotate(self, selector: ObjectSelector, annotations: Mapping[str, str]) -> None:
+        try:
+            self._api().patch_namespaced_custom_object(
+                **_KINDS[selector.kind],
+                namespace=selector.namespace,
+                name=selector.name,
+                body={"metadata": {"annotations": annotations}},
+                _request_timeout=CONNECT_S,
+            )
+        except Exception:
+            with self._lock:
+                self._client = None  # the kubeconfig may have a new token
+            raise
 
-                version = self._read(selector)
-                self._set_error(selector, "")
-                for event in watch.Watch().stream(
-                    self._api().list_namespaced_custom_object,
-                    **_request(selector),
-                    resource_version=version,
-                    timeout_seconds=_WATCH_S,
-                    _request_timeout=(_CONNECT_S, _WATCH_S + 30),
-                ):
-                    if self._closed.is_set():
-                        return
-                    if event["type"] not in ("ADDED", "MODIFIED", "DELETED"):
-                        continue
-                    item = event["object"]
-                    key = (selector.kind, selector.namespace, item["metadata"]["name"])
-                    with self._lock:
-                        cached = self._objects.get(key)
-                        if cached is not None and _version(item) < _version(cached):
-                            continue  # `refresh` has read a newer version
-                        if event["type"] == "DELETED":
-                            self._objects.pop(key, None)
-                        else:
-                            self._objects[key] = item
-                    self._on_change()
-                pause = _FIRST_PAUSE_S
-            except Exception as error:  # the library raises errors of many kinds
-                self._set_error(selector, _reason(selector, error))
-                self._closed.wait(pause)
-                pause = min(pause * 2, _LONGEST_PAUSE_S)
+    def _keep_watching(self, selector: ObjectSelector) -> None:
+        def read() -> str:
+            version = self._read(selector)
+            self._set_error(selector, "")
+            return version
+
+        def take(change: str, item: dict[str, Any]) -> None:
+            key = (selector.kind, selector.namespace, item["metadata"]["name"])
+            with self._lock:
+                cached = self._objects.get(key)
+                if cached is not None and _version(item) < _version(cached):
+                    return  # `refresh` has read a newer version
+                if change == "DELETED":
+                    self._objects.pop(key, None)
+                else:
+                    self._objects[key] = item
+            self._on_change()
+
+        keep_watching(
+            lambda: self._api().list_namespaced_custom_object,
+            _request(selector),
+            read,
+            take,
+            lambda error: self._set_error(selector, _reason(selector, error)),
+            self._closed,
+        )
 
     def _api(self) -> Any:  # noqa: ANN401 - the library has no types
         with self._lock:
@@ -159,7 +167,7 @@ class ObjectCache:
     def _read(self, selector: ObjectSelector) -> str:
         # the result is the resource version of the list
         listed = self._api().list_namespaced_custom_object(
-            **_request(selector), _request_timeout=(_CONNECT_S, _WATCH_S)
+            **_request(selector), _request_timeout=(CONNECT_S, WATCH_S)
         )
         kind, namespace, name = selector
         with self._lock:
@@ -191,10 +199,44 @@ def object_caches(
     return {name: ObjectCache(name, readable[name], on_change, runtime) for name in readable}
 
 
+def keep_watching(
+    api: Callable[[], Callable[..., Any]],
+    request: Mapping[str, str],
+    read: Callable[[], str],
+    take: Callable[[str, Any], None],
+    tell: Callable[[Exception], None],
+    closed: Any,  # noqa: ANN401 - an event of a runtime
+) -> None:
+    """Watch objects until ``closed``; if that fails, tell why and begin again.
+
+    ``api`` gives the library's function that lists them by ``request``. ``read`` lists them and
+    returns the version of the list, and ``take`` gets each change after it, with the object.
+    """
+    pause = _FIRST_PAUSE_S
+    while not closed.is_set():
+        try:
+            from kubernetes import watch  # noqa: PLC0415 - slow (half a second), so only on use
+
+            for event in watch.Watch().stream(
+                api(),
+                **request,
+                resource_version=read(),
+                timeout_seconds=WATCH_S,
+                _request_timeout=(CONNECT_S, WATCH_S + 30),
+            ):
+                if closed.is_set():
+                    return
+                if event["type"] in ("ADDED", "MODIFIED", "DELETED"):
+                    take(event["type"], event["object"])
+            pause = _FIRST_PAUSE_S
+        except Exception as error:  # the library raises errors of many kinds
+            tell(error)
+            closed.wait(pause)
+            pause = min(pause * 2, _LONGEST_PAUSE_S)
+
+
 def _request(selector: ObjectSelector) -> dict[str, str]:
-    group, version, plural = _KINDS[selector.kind]
-    request = {"group": group, "version": version, "plural": plural}
-    request["namespace"] = selector.namespace
+    request = {**_KINDS[selector.kind], "namespace": selector.namespace}
     if selector.name:  # a call for one object needs fewer rights than for a whole namespace
         request["field_selector"] = f"metadata.name={selector.name}"
     return request
@@ -207,7 +249,7 @@ def _is_answer(error: Exception) -> bool:
 
 def _reason(selector: ObjectSelector, error: Exception) -> str:
     if _is_answer(error):  # otherwise the whole cluster is unreachable
-        plural = _KINDS[selector.kind][2]
+        plural = _KINDS[selector.kind]["plural"]
         reason = getattr(error, "reason", None) or type(error).__name__
         return f"{plural} in {selector.namespace}: {reason}"
     return reason_of(error)

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf
-from typing import Any
 from urllib.parse import urlsplit
 
 from demandops.base import http_call
@@ -138,7 +137,6 @@ class ReconcileTrigger:
         self._reported: dict[str, str] = {}
         self._clusters = {name: access for name, access in clusters.items() if access.wake}
         self._config: Config | None = None
-        self._apis: dict[str, Any] = {}
         self._wakes: dict[tuple[str, ...], _Wake] = {}
         self._pushed = False
         self._changed = runtime.event()
@@ -230,7 +228,6 @@ class ReconcileTrigger:
             self._call(wake, self._clusters[wake.cluster], self._config)
             wake.pushed = None
         except Exception as error:
-            self._apis.pop(wake.cluster, None)  # the kubeconfig may have a new token
             wake.handled = {}
             if wake.pause == _FIRST_RETRY_S:
                 # the texts of other errors may have URLs and secrets
@@ -267,27 +264,16 @@ class ReconcileTrigger:
             # a Receiver ignores the body
             _send(access.receiver, b"{}", access.secret(), "X-Signature", {})
         elif access.kubeconfig:
-            if name not in self._apis:
-                self._apis[name] = access.api()
-            settings, now = config.repo_settings, self._runtime.now().isoformat()
+            settings, cache = config.repo_settings, self._caches[name]
+            asked_at = {REQUESTED_AT: self._runtime.now().isoformat()}
             for domain in wake.domains:
                 if argocd:
-                    group, version, plural = "argoproj.io", "v1alpha1", "applications"
-                    namespace, object_name = argocd.namespace, project_of(domain, settings)
-                    annotation = {"argocd.argoproj.io/refresh": "normal"}
+                    folder = project_of(domain, settings)
+                    application = ObjectSelector("Application", argocd.namespace, folder)
+                    cache.annotate(application, {"argocd.argoproj.io/refresh": "normal"})
                 else:
-                    group, version, plural = "source.toolkit.fluxcd.io", "v1", "gitrepositories"
-                    namespace, object_name = domain.namespace, settings.source
-                    annotation = {REQUESTED_AT: now}
-                self._apis[name].patch_namespaced_custom_object(
-                    group=group,
-                    version=version,
-                    namespace=namespace,
-                    plural=plural,
-                    name=object_name,
-                    body={"metadata": {"annotations": annotation}},
-                    _request_timeout=_TIMEOUT_S,
-                )
+                    source = ObjectSelector("GitRepository", domain.namespace, settings.source)
+                    cache.annotate(source, asked_at)
         else:
             missing = "webhook" if argocd else "receiver"
             raise NoAnswer(f"it has neither a kubeconfig nor a {missing}")

@@ -129,6 +129,10 @@ class Near(_InArea):
 
     _has_hysteresis = model_validator(mode="after")(_refuse_distances)
 
+    @property
+    def reach(self) -> float:  # how far from the area an entity may matter
+        return self.stop
+
 
 class Together(CamelModel):
     """A condition that starts if two entities are at most ``start`` metres apart.
@@ -168,6 +172,10 @@ class Count(_InArea):
             )
         return self
 
+    @property
+    def reach(self) -> float:
+        return self.radius
+
 
 class Threshold(CamelModel):
     """A condition that starts if a number is above ``above``, or below ``below``.
@@ -196,6 +204,13 @@ class Threshold(CamelModel):
                 f"{self.below:g}"
             )
         return self
+
+    def is_past(self, value: float) -> bool:
+        above, below = self.above, self.below
+        return (above is not None and value > above) or (below is not None and value < below)
+
+    def is_back(self, value: float) -> bool:
+        return value <= self.stop if self.above is not None else value >= self.stop
 
 
 def _clock(text: str) -> time:

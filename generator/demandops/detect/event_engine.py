@@ -9,127 +9,81 @@ from fnmatch import translate
 from functools import partial
 from math import floor, hypot, inf
 from statistics import median
-from typing import Any
 
 from demandops.detect.condition import Count, Hours, Near, Threshold, Together
 from demandops.detect.observations import Cell, Event, Key, Observation, Phase, State, Who
 from demandops.detect.rule_file import Rule, RuleFile, Values
 from demandops.model.config.base_model import seconds_of
 
-# ---- compiled rules: what a rule of the file means for the engine ----
-
+# ---- rules, as the engine applies them ----
 
 Seen = Mapping[Who, Observation]
-
-
-# The values of an event for the rule's template, and the event's cause in words for people.
-Facts = tuple[Values, str]
 
 
 class CompiledRule:
     def __init__(self, rule: Rule) -> None:
         self.name, self.subjects, self.sources = rule.name, rule.subjects, rule.sources
-        self.dwell = float(seconds_of(rule.dwell))
+        self.condition, self.dwell = rule.condition, float(seconds_of(rule.dwell))
         # A bracket in a pattern stands for itself, but ``translate`` gives it a meaning.
         patterns = [pattern.replace("[", "[[]") for pattern in rule.entities]
         self._names = None if "*" in patterns else re.compile("|".join(map(translate, patterns)))
 
-    def is_for(self, entity: str) -> bool:
-        return self._names is None or self._names.match(entity) is not None
-
     def takes(self, who: Who) -> bool:
-        return self.is_for(who[1])
+        # The patterns of a rule on pairs limit only the entities of the first source.
+        return who[0] != self.sources[0] or self._names is None or bool(self._names.match(who[1]))
 
     def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
         # A rule on pairs from one source names this source once, but its events have two entities.
         return tuple(zip((*self.sources, *self.sources), subjects, strict=False))
 
-    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        raise NotImplementedError
-
-    def _named(self, subjects: tuple[str, ...]) -> dict[str, str | float]:
-        return {"rule": self.name, **dict(zip(self.subjects, subjects, strict=True))}
-
-
-class HoursRule(CompiledRule):
-    def __init__(self, rule: Rule, hours: Hours) -> None:
-        super().__init__(rule)
-        self.hours = hours
-
-    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        return self._named(subjects), "the hours of the schedule"
-
-
-class ThresholdRule(CompiledRule):
-    def __init__(self, rule: Rule, limits: Threshold) -> None:
-        super().__init__(rule)
-        self.field, self._limits = limits.field, limits
-
-    def starts(self, value: float) -> bool:
-        above, below = self._limits.above, self._limits.below
-        return (above is not None and value > above) or (below is not None and value < below)
-
-    def stops(self, value: float) -> bool:
-        is_low = value <= self._limits.stop
-        return is_low if self._limits.above is not None else value >= self._limits.stop
-
-    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        value = seen[self.sources[0], subjects[0]].values.get(self.field, 0.0)
-        named = {**self._named(subjects), "value": value}
-        return named, f"{self.field} of {subjects[0]} is {value:g}"
+    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> tuple[Values, str]:
+        """Return an event's values for the rule's template, and its cause in words for people."""
+        values: dict[str, str | float] = {"rule": self.name}
+        values |= dict(zip(self.subjects, subjects, strict=True))
+        entities = [seen[who] for who in self.entities_of(subjects)]
+        x, y = (entities[0].position if entities else None) or (0.0, 0.0)
+        match self.condition:
+            case Threshold(field=field):
+                value = entities[0].values.get(field, 0.0)
+                return values | {"value": value}, f"{field} of {subjects[0]} is {value:g}"
+            case Count():
+                return values | {"count": count}, f"{count} entities are in or near the area"
+            case Near() as area:
+                values |= {"x": x, "y": y, "distance": (away := area.distance(x, y))}
+                return values, f"{subjects[0]} is {away:.1f} m from the area"
+            case Together():
+                values |= {"x": x, "y": y, "distance": (away := distance(*entities))}
+                return values, f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
+        return values, "the hours of the schedule"
 
 
-class AreaRule(CompiledRule):
-    """A rule on one entity's distance to an area, or on the number of entities in or near it."""
-
-    def __init__(self, rule: Rule, condition: Near | Count) -> None:
-        super().__init__(rule)
-        self.area = condition
-        self.count = condition if isinstance(condition, Count) else None
-        self.start: float = condition.radius if isinstance(condition, Count) else condition.start
-        self.stop: float = condition.radius if isinstance(condition, Count) else condition.stop
-
-    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        named = self._named(subjects)
-        if self.count is not None:
-            return {**named, "count": count}, f"{count} entities are in or near the area"
-        x, y = seen[self.sources[0], subjects[0]].position or (0.0, 0.0)
-        distance = self.area.distance(x, y)
-        text = f"{subjects[0]} is {distance:.1f} m from the area"
-        return {**named, "x": x, "y": y, "distance": distance}, text
+def distance(last: Observation, other: Observation) -> float:
+    assert last.position is not None and other.position is not None  # noqa: S101 - rules need them
+    return hypot(last.position[0] - other.position[0], last.position[1] - other.position[1])
 
 
-class PairRule(CompiledRule):
+class Pairs:
     # The map is divided into squares as wide as the distance at which the condition stops. So all
     # partners of an entity are in the entity's square and the squares around it, and an entity is
     # not compared with all others.
 
-    def __init__(self, rule: Rule, condition: Together) -> None:
-        super().__init__(rule)
-        self.start, self.stop = condition.start, condition.stop
-        self._first, self._second = self.sources[0], self.sources[-1]
-
-    def takes(self, who: Who) -> bool:
-        # The patterns of the rule limit only the entities of the first source.
-        return who[0] != self._first or self.is_for(who[1])
+    def __init__(self, rule: CompiledRule, condition: Together) -> None:
+        self.rule, self.condition = rule, condition
+        self._first, self._second = rule.sources[0], rule.sources[-1]
 
     def key(self, who: Who, other: Who) -> Key:
         # A pair is one event, in whatever order its entities report.
         if self._first == self._second:
-            return self.name, (min(who[1], other[1]), max(who[1], other[1]))
-        return self.name, (who[1], other[1]) if who[0] == self._first else (other[1], who[1])
-
-    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        last, other = (seen[who] for who in self.entities_of(subjects))
-        (x, y), away = last.position or (0.0, 0.0), distance(last, other)
-        text = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
-        return {**self._named(subjects), "x": x, "y": y, "distance": away}, text
+            return self.rule.name, (min(who[1], other[1]), max(who[1], other[1]))
+        first, second = (who, other) if who[0] == self._first else (other, who)
+        return self.rule.name, (first[1], second[1])
 
     def _cell(self, observation: Observation | None) -> Cell | None:
         if observation is None or observation.position is None:
             return None
         x, y = observation.position
-        return self.name, observation.source, floor(x / self.stop), floor(y / self.stop)
+        size = self.condition.stop
+        return self.rule.name, observation.source, floor(x / size), floor(y / size)
 
     def move(
         self,
@@ -155,26 +109,12 @@ class PairRule(CompiledRule):
         if cell is None:
             return
         source = self._second if seen.source == self._first else self._first
-        _, _, at_x, at_y = cell
+        name, _, at_x, at_y = cell
         for x in (at_x - 1, at_x, at_x + 1):
             for y in (at_y - 1, at_y, at_y + 1):
-                for entity in cells.get((self.name, source, x, y), ()):
+                for entity in cells.get((name, source, x, y), ()):
                     if (source, entity) != seen.who:
                         yield source, entity
-
-
-def distance(last: Observation, other: Observation) -> float:
-    assert last.position is not None and other.position is not None  # noqa: S101 - rules need them
-    return hypot(last.position[0] - other.position[0], last.position[1] - other.position[1])
-
-
-_COMPILED: Mapping[type, Callable[[Rule, Any], CompiledRule]] = {
-    Near: AreaRule,
-    Count: AreaRule,
-    Together: PairRule,
-    Threshold: ThresholdRule,
-    Hours: HoursRule,
-}
 
 
 # ---- an index of areas by position, so that an entity is compared only with those near it ----
@@ -184,31 +124,35 @@ _SMALLEST_CELL_M = 10.0
 _MOST_CELLS = 4096
 
 
+# A rule, and its condition on an area
+Area = tuple[CompiledRule, Near | Count]
+
+
 class AreaGrid:
     """Rules on areas, indexed by the squares of the map that each area and its margin touch."""
 
-    def __init__(self, rules: Iterable[AreaRule]) -> None:
-        boxes: list[tuple[AreaRule, tuple[float, float, float, float]]] = []
-        for rule in rules:
-            (low_x, low_y, high_x, high_y), around = rule.area.bounds, rule.stop
-            boxes.append((rule, (low_x - around, low_y - around, high_x + around, high_y + around)))
+    def __init__(self, areas: Iterable[Area]) -> None:
+        boxes: list[tuple[Area, tuple[float, float, float, float]]] = []
+        for area in areas:
+            (low_x, low_y, high_x, high_y), around = area[1].bounds, area[1].reach
+            boxes.append((area, (low_x - around, low_y - around, high_x + around, high_y + around)))
         # With squares as wide as a usual area, an area touches few squares and a square few areas.
         sizes = [max(box[2] - box[0], box[3] - box[1]) for _, box in boxes]
         self._size = max(_SMALLEST_CELL_M, median(sizes) if sizes else 0.0)
-        cells = defaultdict[tuple[int, int], list[AreaRule]](list)
-        large: list[AreaRule] = []
-        for rule, box in boxes:
+        cells = defaultdict[tuple[int, int], list[Area]](list)
+        large: list[Area] = []
+        for area, box in boxes:
             left, bottom, right, top = (floor(edge / self._size) for edge in box)
             if (right - left + 1) * (top - bottom + 1) > _MOST_CELLS:
-                large.append(rule)
+                large.append(area)
                 continue
             for x in range(left, right + 1):
                 for y in range(bottom, top + 1):
-                    cells[x, y].append(rule)
+                    cells[x, y].append(area)
         self._large = tuple(large)
         self._cells = {cell: (*large, *inside) for cell, inside in cells.items()}
 
-    def at(self, x: float, y: float) -> Sequence[AreaRule]:
+    def at(self, x: float, y: float) -> Sequence[Area]:
         # a superset of the rules whose area or margin contains the position
         return self._cells.get((floor(x / self._size), floor(y / self._size)), self._large)
 
@@ -227,22 +171,23 @@ class EventEngine:
         self.timeouts = {
             name: float(seconds_of(source.timeout)) for name, source in file.sources.items()
         }
-        self.hours: list[HoursRule] = []
-        self.thresholds: dict[str, list[ThresholdRule]] = {name: [] for name in file.sources}
-        self.pairs: dict[str, list[PairRule]] = {name: [] for name in file.sources}
-        areas = defaultdict[str, list[AreaRule]](list)
+        self.hours: list[tuple[CompiledRule, Hours]] = []
+        self.thresholds: dict[str, list[tuple[CompiledRule, Threshold]]] = defaultdict(list)
+        self.pairs: dict[str, list[Pairs]] = defaultdict(list)
+        areas = defaultdict[str, list[Area]](list)
         for each in file.rules:
-            rule = _COMPILED[type(each.condition)](each, each.condition)
-            self.rules[each.name] = rule
-            for source in dict.fromkeys(rule.sources):
-                if isinstance(rule, AreaRule):
-                    areas[source].append(rule)
-                elif isinstance(rule, PairRule):
-                    self.pairs[source].append(rule)
-                elif isinstance(rule, ThresholdRule):
-                    self.thresholds[source].append(rule)
-            if isinstance(rule, HoursRule):
-                self.hours.append(rule)
+            rule = self.rules[each.name] = CompiledRule(each)
+            match each.condition:
+                case Near() | Count() as area:
+                    areas[area.source].append((rule, area))
+                case Together() as together:
+                    pairs = Pairs(rule, together)
+                    for source in dict.fromkeys(rule.sources):
+                        self.pairs[source].append(pairs)
+                case Threshold() as limits:
+                    self.thresholds[limits.source].append((rule, limits))
+                case Hours() as hours:
+                    self.hours.append((rule, hours))
         self.areas = {name: AreaGrid(areas[name]) for name in file.sources}
 
     def start(self, now: float, held: Iterable[Key] = (), settle_s: float = 0.0) -> State:
@@ -256,7 +201,7 @@ class EventEngine:
         # A count is complete only when each of its entities had the time to report.
         for name, _ in keys:
             rule = self.rules.get(name)
-            if isinstance(rule, AreaRule) and rule.count is not None:
+            if rule is not None and isinstance(rule.condition, Count):
                 settle = max(settle, self.timeouts[rule.sources[0]])
         step = EngineStep(self, State(now, due=-inf, settled=now + settle, hours_due=now))
         for key in keys:
@@ -326,8 +271,8 @@ class EngineStep:
             yield self.state.hours_due, self._look_at_hours
         if self.state.now < self.state.settled:
             for rule in self._engine.rules.values():
-                if isinstance(rule, AreaRule):
-                    yield self.state.settled, partial(self._latch_count, rule)
+                if isinstance(rule.condition, Count):
+                    yield self.state.settled, partial(self._count, rule.name, 0)
         timeouts = self._engine.timeouts
         for who, last in self.state.seen.items():
             yield last.at + timeouts[last.source], partial(self._lose_silent, who, last)
@@ -340,11 +285,11 @@ class EngineStep:
             self._begin(key, self._engine.rules[key[0]])
 
     def _look_at_hours(self) -> None:
-        for rule in self._engine.hours:
-            is_on = rule.hours.is_on(self.state.now)
+        for rule, hours in self._engine.hours:
+            is_on = hours.is_on(self.state.now)
             self._latch((rule.name, ()), rule, is_on, not is_on)
         self.state.hours_due = min(
-            rule.hours.next_check(self.state.now) for rule in self._engine.hours
+            hours.next_check(self.state.now) for _, hours in self._engine.hours
         )
         self.state.due = min(self.state.due, self.state.hours_due)
 
@@ -363,7 +308,7 @@ class EngineStep:
         for name in sorted(self.state.counted.pop(who, ())):
             self._count(name, -1)
         for pair in self._engine.pairs[who[0]]:
-            if pair.takes(who):
+            if pair.rule.takes(who):
                 pair.move(self.state.cells, who[1], last, None)
 
     # ---- observations ----
@@ -376,35 +321,35 @@ class EngineStep:
         self.state.seen[who] = observation
         self.state.awaited.pop(who, None)
         self.state.due = min(self.state.due, observation.at + self._engine.timeouts[source])
-        for rule in self._engine.thresholds[source]:
-            value = observation.values.get(rule.field)
-            if value is not None and rule.is_for(entity):
-                key = (rule.name, (entity,))
-                self._latch(key, rule, rule.starts(value), rule.stops(value))
+        for rule, limits in self._engine.thresholds[source]:
+            value = observation.values.get(limits.field)
+            if value is not None and rule.takes(who):
+                is_past, is_back = limits.is_past(value), limits.is_back(value)
+                self._latch((rule.name, (entity,)), rule, is_past, is_back)
         if observation.position is not None:
             self._compare_with_areas(observation, *observation.position)
             for pair in self._engine.pairs[source]:
-                if pair.takes(who):
+                if pair.rule.takes(who):
                     pair.move(self.state.cells, entity, before, observation)
                     self._compare_with_others(pair, observation)
 
     def _compare_with_areas(self, observation: Observation, x: float, y: float) -> None:
         who, entity = observation.who, observation.entity
         compared, counted = set[str](), set[str]()
-        for rule in self._engine.areas[observation.source].at(x, y):
-            if not rule.is_for(entity):
+        for rule, area in self._engine.areas[observation.source].at(x, y):
+            if not rule.takes(who):
                 continue
-            away = rule.area.distance(x, y)
-            if rule.count is None:
+            away = area.distance(x, y)
+            if isinstance(area, Near):
                 compared.add(rule.name)
                 key: Key = (rule.name, (entity,))
-                self._latch(key, rule, away <= rule.start, away > rule.stop)
-            elif away <= rule.start:
+                self._latch(key, rule, away <= area.start, away > area.stop)
+            elif away <= area.radius:
                 counted.add(rule.name)
         # The index does not yield the areas that the entity has left, so their events end here.
         for key in sorted(self.state.engaged.get(who, ())):
             left = self._engine.rules[key[0]]
-            if isinstance(left, AreaRule) and key[0] not in compared:
+            if isinstance(left.condition, Near) and key[0] not in compared:
                 self._latch(key, left, False, True)
         before = self.state.counted.get(who, frozenset())
         if counted != before:
@@ -412,12 +357,13 @@ class EngineStep:
             for name in sorted(counted ^ before):
                 self._count(name, 1 if name in counted else -1)
 
-    def _compare_with_others(self, rule: PairRule, observation: Observation) -> None:
+    def _compare_with_others(self, pairs: Pairs, observation: Observation) -> None:
         who, compared = observation.who, set[Key]()
-        for other in sorted(rule.around(self.state.cells, observation)):
-            key, away = rule.key(who, other), distance(observation, self.state.seen[other])
+        rule, limits = pairs.rule, pairs.condition
+        for other in sorted(pairs.around(self.state.cells, observation)):
+            key, away = pairs.key(who, other), distance(observation, self.state.seen[other])
             compared.add(key)
-            self._latch(key, rule, away <= rule.start, away > rule.stop)
+            self._latch(key, rule, away <= limits.start, away > limits.stop)
         # The squares around do not have the partners that are far away, so their events end here. A
         # partner that is still awaited after a restart has no position yet.
         for key in sorted(self.state.engaged.get(who, ())):
@@ -427,15 +373,10 @@ class EngineStep:
 
     def _count(self, name: str, change: int) -> None:
         rule = self._engine.rules[name]
-        self.state.counts[name] = self.state.counts.get(name, 0) + change
-        if isinstance(rule, AreaRule):
-            self._latch_count(rule)
-
-    def _latch_count(self, rule: AreaRule) -> None:
-        count = self.state.counts.get(rule.name, 0)
-        if rule.count is not None:
-            stops = count <= rule.count.stop and self.state.now >= self.state.settled
-            self._latch((rule.name, ()), rule, count >= rule.count.start, stops)
+        count = self.state.counts[name] = self.state.counts.get(name, 0) + change
+        if isinstance(limits := rule.condition, Count):
+            stops = count <= limits.stop and self.state.now >= self.state.settled
+            self._latch((name, ()), rule, count >= limits.start, stops)
 
     # ---- events ----
 

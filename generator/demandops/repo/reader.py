@@ -21,15 +21,10 @@ from demandops.decide.state import rendered_files
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Rollback
 from demandops.repo import verification
+from demandops.repo.git import repository as repositories
 from demandops.repo.git import tree as trees
 from demandops.repo.git.remote_repository import connect, is_url
-from demandops.repo.git.repository import (
-    LastFetch,
-    StateRepository,
-    access_error,
-    needs_push,
-    reading,
-)
+from demandops.repo.git.repository import StateRepository, access_error, reading
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
 from demandops.repo.history.commit_message import PROPOSAL
@@ -53,7 +48,7 @@ class Reader:
         try:
             # The clone of a URL stays on the disk for later readers. It is in a folder of readers,
             # so that none takes over a generator's journal.
-            is_cloned = is_url(address) or (not only_read and needs_push(address))
+            is_cloned = is_url(address) or (not only_read and repositories.needs_push(address))
             slot = Slot(settings.data_home(address) / "reader") if is_cloned else None
         except OSError as error:
             raise access_error(error, f"the data folder of {address}") from None
@@ -278,5 +273,5 @@ def opened_offline(address: str) -> Iterator[Reader | None]:
     if not clones:
         yield None
         return
-    repository = LastFetch(clones[0])
+    repository = repositories.LastFetch(clones[0])
     yield Reader(repository, repository.tip())

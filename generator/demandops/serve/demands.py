@@ -24,14 +24,7 @@ from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import replace
 
 from demandops.base import errors
-from demandops.base.errors import (
-    DemandOpsError,
-    InvalidInput,
-    QueueFull,
-    ShuttingDown,
-    StateRepoError,
-    Unsound,
-)
+from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
 from demandops.serve.journal import Journal, ProposalRecord, Receipt, State, Ticket
@@ -156,12 +149,11 @@ class Demands:
         self._limit, self._requester_limit = limit, requester_limit
         self._of_requester = Counter[str]()
         self._changed = runtime.condition()
-        self._tickets = dict(journal.pending)
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
         self._queue = FairQueue(in_order=requester_limit is None)
-        for ticket in self._tickets.values():
+        for ticket in journal.pending.values():
             log.info("resuming demand %s from the journal", ticket.operation)
             if ticket.proposal is None:
                 self._enqueue(ticket)
@@ -178,7 +170,7 @@ class Demands:
     def proposed(self) -> list[Ticket]:
         """The demands of all proposals; a new one may not be on its branch yet."""
         with self._changed:
-            return [ticket for ticket in self._tickets.values() if ticket.proposal is not None]
+            return [ticket for ticket in self._journal.pending.values() if ticket.proposal]
 
     @property
     def unpublished(self) -> int:
@@ -264,18 +256,17 @@ class Demands:
     def _take_in(self) -> None:
         if not self._arrived:
             return
-        taken, refused = list[Ticket](), list[tuple[Ticket, DemandOpsError]]()
+        taken, refused = dict[str, Ticket](), list[tuple[Ticket, DemandOpsError]]()
         with self._changed:
             for _ in range(len(self._arrived)):
                 ticket = self._arrived.popleft()
-                if (error := self._why_refused(ticket, len(taken))) is not None:
+                if (error := self._why_refused(ticket, taken)) is not None:
                     refused.append((ticket, error))
                     continue
                 self._of_requester[ticket.requester] += 1
-                self._tickets[ticket.operation] = ticket
-                taken.append(ticket)
+                taken[ticket.operation] = ticket
             try:
-                self._journal.append(taken)
+                self._journal.append(taken.values())
             except Exception as failure:
                 if isinstance(failure, DemandOpsError):
                     why = failure
@@ -284,37 +275,38 @@ class Demands:
                     why = errors.internal(failure)
                     log.exception("internal error while journaling demands")
                 self.wake()  # so that the worker ends the process if the journal is unsound
-                for ticket in taken:
-                    del self._tickets[ticket.operation]
+                for ticket in taken.values():
                     self._of_requester[ticket.requester] -= 1
                     refused.append((ticket, why))
-                taken = []
-            for ticket in taken:
+                taken = {}
+            for ticket in taken.values():
                 _change(ticket, "queued")
                 self._queue.append(ticket)
-            self._new += taken
+            self._new += taken.values()
             self._changed.notify()
-        for ticket in taken:
+        for ticket in taken.values():
             ticket.journaled.set_result(True)
         for ticket, error in refused:
             ticket.refuse(error)
 
-    def _why_refused(self, ticket: Ticket, others: int) -> DemandOpsError | None:
+    def _why_refused(self, ticket: Ticket, others: dict[str, Ticket]) -> DemandOpsError | None:
         if self.is_closed:
-            return ShuttingDown("the generator is shutting down; send the demand again later")
+            return errors.ShuttingDown(
+                "the generator is shutting down; send the demand again later"
+            )
         # the others were accepted just before, and are not queued yet
-        if others + len(self._queue) >= self._limit:
+        if len(others) + len(self._queue) >= self._limit:
             why = f" and cannot be published ({self.blocked})" if self.blocked else ""
-            return QueueFull(
+            return errors.QueueFull(
                 f"{self._limit} demands are queued already{why}; send the demand again later"
             )
-        if ticket.operation in self._tickets:
+        if ticket.operation in self._journal.pending or ticket.operation in others:
             message = "is the operation id of another demand; choose a new one"
             return errors.Refused([errors.fault("", f"'{ticket.operation}' {message}")])
         who = ticket.requester
         if (limit := self._requester_limit) is not None and self._of_requester[who] >= limit:
             whose = f"of {quoted(who)}" if who else "without a requester"
-            return QueueFull(
+            return errors.QueueFull(
                 f"{limit} demands {whose} have no answer yet; send the demand again "
                 "later, or raise the node's parameter requester_queue_limit"
             )
@@ -355,12 +347,16 @@ class Demands:
     def withdraw(self, operation: str) -> bool:
         self._take_in()
         with self._changed:
-            ticket = self._tickets.get(operation)
+            tickets = {ticket.operation: ticket for ticket in self._taken_back}
+            ticket = self._journal.pending.get(operation) or tickets.get(operation)
             if ticket is None or "withdrawn" not in _NEXT[ticket.state]:
                 return ticket is not None and ticket.state == "withdrawn"
             try:
                 self._withdraw(ticket, TAKEN_BACK)
-            except (StateRepoError, Unsound) as error:  # if unsound, the worker ends the process
+            except (
+                errors.StateRepoError,
+                errors.Unsound,
+            ) as error:  # if unsound, the worker ends the process
                 log.error("demand %s cannot be withdrawn: %s", operation, error)
                 self.wake()
                 return False
@@ -369,7 +365,7 @@ class Demands:
     def _give_up_what_is_dropped(self) -> None:
         for request in self._journal.drop_requests():
             with self._changed:
-                ticket = self._tickets.get(request.name.partition("-")[2])
+                ticket = self._journal.pending.get(request.name.partition("-")[2])
                 if ticket is None:  # it is answered
                     request.unlink()
                 elif ticket.state != "withdrawn":
@@ -418,7 +414,11 @@ class Demands:
             if isinstance(result, Receipt) or ticket.state == "done":
                 continue
             if str(result) != TAKEN_BACK:  # a client that took its demand back needs no notice
-                text = result.text_with_codes() if isinstance(result, InvalidInput) else str(result)
+                text = (
+                    result.text_with_codes()
+                    if isinstance(result, errors.InvalidInput)
+                    else str(result)
+                )
                 ticket.notify("refused", text)
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
@@ -434,7 +434,7 @@ class Demands:
                 )
                 try:
                     self._journal.mark_done(operations, durably=durably)
-                except StateRepoError as error:  # the next write makes the removal durable
+                except errors.StateRepoError as error:  # the next write makes the removal durable
                     log.error(
                         "an answer cannot be journaled, so after a crash the demand may be carried "
                         "out again: %s",
@@ -443,8 +443,9 @@ class Demands:
                     self._journal.mark_done(operations)
             for ticket, _ in results:
                 _change(ticket, "done")
-                # a proposed demand left the count of its requester already
-                if self._tickets.pop(ticket.operation, None) and ticket.proposal is None:
+                # a proposed demand left the count of its requester already, and the end of a lease
+                # was never in it
+                if ticket.demand.operation != "expire" and ticket.proposal is None:
                     self._leave(ticket)
         for ticket, result in results:
             if isinstance(result, Receipt):
@@ -456,10 +457,10 @@ class Demands:
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
         self.answer([(ticket, error) for ticket in batch], keep)
 
-    def end(self, error: Unsound) -> None:
+    def end(self, error: errors.Unsound) -> None:
         self.close()
         with self._changed:
-            left = list(self._tickets.values())
+            left = [*self._journal.pending.values(), *self._taken_back]
         self.fail(left, error, keep=True)
 
     def _enqueue(self, ticket: Ticket) -> None:

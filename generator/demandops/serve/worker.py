@@ -9,30 +9,15 @@ from datetime import datetime
 from math import inf
 
 from demandops.base import errors
-from demandops.base.errors import (
-    DemandOpsError,
-    InvalidInput,
-    Refused,
-    StateRepoError,
-    Unsound,
-    Withdrawn,
-    fault,
-    internal,
-)
+from demandops.base.errors import DemandOpsError, StateRepoError
 from demandops.base.runtime import Runtime
 from demandops.base.settings import MAIN_BRANCH, RENDER_VERSION
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand, Rollback
+from demandops.repo.git import repository as repositories
 from demandops.repo.git import signing
-from demandops.repo.git.repository import (
-    FetchInterrupted,
-    PushDenied,
-    StateRepository,
-    Unavailable,
-    access_error,
-    disk_error,
-)
+from demandops.repo.git.repository import PushDenied, Unavailable, access_error
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history.commit_log import operations_since
 from demandops.repo.history.commit_message import compose, generator_signature
@@ -40,18 +25,8 @@ from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.ledger_files import restoration
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
-from demandops.serve.agenda import (
-    FIRST_PAUSE_S,
-    LIMIT_LOCAL,
-    LIMIT_REMOTE,
-    LONGEST_EVALUATION_S,
-    Agenda,
-    Backoff,
-    RateLimit,
-    What,
-    may_take_long,
-    within,
-)
+from demandops.serve import agenda
+from demandops.serve.agenda import Agenda, Backoff, RateLimit, What
 from demandops.serve.approvals.approvals import Approvals, Result
 from demandops.serve.demands import TAKEN_BACK, Demands
 from demandops.serve.journal import Receipt, Ticket
@@ -141,7 +116,7 @@ class Worker:
 
     def __init__(
         self,
-        repository: StateRepository,
+        repository: repositories.StateRepository,
         snapshot: Snapshot,
         demands: Demands,
         approvals: Approvals,
@@ -157,7 +132,7 @@ class Worker:
         self._heartbeat = repository.while_waiting = heartbeat
         self._rate_limit = RateLimit()
         self._agenda = Agenda(fetch_interval, self._runtime, local=repository.on_this_disk)
-        self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
+        self._batch_limit = agenda.LIMIT_LOCAL if repository.always_current else agenda.LIMIT_REMOTE
         self._backoff = Backoff(self._batch_limit, self._runtime)
         self._must_fetch = self._tip_is_fresh = False
         self._refusal_patience_s = refusal_patience_s
@@ -235,7 +210,9 @@ class Worker:
                 self._runtime.recovered(_NAME)
 
     def _fail(self, batch: list[Ticket], error: Exception) -> None:
-        if isinstance(error, Unsound):  # the process must end; the next one reads the journal
+        if isinstance(
+            error, errors.Unsound
+        ):  # the process must end; the next one reads the journal
             self._demands.end(error)
             raise error
         if isinstance(error, errors.ShuttingDown):
@@ -246,7 +223,7 @@ class Worker:
             self._runtime.failed(_NAME, error)
         if not batch:
             # not at each failure in a row, because git then reads all objects
-            if self._agenda.failed("all", first=FIRST_PAUSE_S) == FIRST_PAUSE_S:
+            if self._agenda.failed("all", first=agenda.FIRST_PAUSE_S) == agenda.FIRST_PAUSE_S:
                 try:
                     self._repository.renew_if_damaged()
                 except StateRepoError as damage:
@@ -334,8 +311,8 @@ class Worker:
         began, has_own_work = self._runtime.monotonic(), not commits.is_empty
         for number, ticket in enumerate(part):
             self._require_not_ending()
-            is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
-            if number and (is_late or may_take_long(ticket.demand)):
+            is_late = self._runtime.monotonic() - began > agenda.LONGEST_EVALUATION_S
+            if number and (is_late or agenda.may_take_long(ticket.demand)):
                 part, left = part[:number], part[number:] + left
                 break
             if ticket.demand.is_release:
@@ -347,7 +324,7 @@ class Worker:
         if not left:
             for ticket in self._ended_leases(commits.head)[: self._backoff.max_demands - len(part)]:
                 results.append(self._evaluate(commits, ticket))
-                if self._runtime.monotonic() - began > LONGEST_EVALUATION_S:
+                if self._runtime.monotonic() - began > agenda.LONGEST_EVALUATION_S:
                     break
         evaluated = self._runtime.monotonic()
         if commits.is_empty and not self._tip_is_fresh:
@@ -393,7 +370,7 @@ class Worker:
         # only once the batch is published. Errors that concern all demands are raised; others leave
         # the rest of the batch alone.
         if ticket.state == "withdrawn":
-            return Withdrawn(ticket.withdrawn or TAKEN_BACK)
+            return errors.Withdrawn(ticket.withdrawn or TAKEN_BACK)
         if ticket.unread is not None:
             return ticket.unread
         try:
@@ -401,7 +378,7 @@ class Worker:
             if isinstance(demand, Rollback):
                 if not self._repository.includes(str(commits.start.commit), demand.to):
                     message = f"commit {demand.to} is not in the history of the state repo; roll "
-                    raise Refused([fault("", f"{message}back to one that is")])
+                    raise errors.Refused([errors.fault("", f"{message}back to one that is")])
                 demand = restoration(self._repository.objects, demand)
             state = commits.head.state
             # of all services, once for each configuration; that is not this demand's work
@@ -418,7 +395,7 @@ class Worker:
                     lambda request, config: self._rate_limit.faults(
                         request, config, ticket.operation, ticket.received
                     ),
-                    within(state.config.repo_settings.limits, self._runtime),
+                    agenda.within(state.config.repo_settings.limits, self._runtime),
                 )
             if self._approvals.proposals:
                 self._approvals.refuse_strangers(decision)
@@ -426,7 +403,7 @@ class Worker:
                 return decision
             # from here on the demand can no longer be taken back
             if not self._demands.commit(ticket):
-                return Withdrawn(ticket.withdrawn or TAKEN_BACK)
+                return errors.Withdrawn(ticket.withdrawn or TAKEN_BACK)
             if decision.request.operation == "put":
                 self._approvals.withdraw_replaced(decision.request)
             if decision.outcome == "waiting":
@@ -440,7 +417,7 @@ class Worker:
                 commits.record_in_next_commit(ticket.operation, "waiting" if waits else "unchanged")
                 commit = str(commits.head.commit)
             return self._approvals.receipt(ticket, decision, commit, state)
-        except InvalidInput as error:
+        except errors.InvalidInput as error:
             if ticket.has_released:  # the demand released a proposal, which had no claims yet
                 commits.record_in_next_commit(ticket.operation, "released")
                 commit = str(commits.head.commit)
@@ -454,7 +431,7 @@ class Worker:
         except SigningFailed as error:
             return error
         except Exception as error:  # a bug that one demand triggers must not stop the others
-            reason = disk_error(error, self._repository.address)
+            reason = repositories.disk_error(error, self._repository.address)
             if reason is not None:  # the state repo fails, so no demand can be evaluated
                 raise reason from None
             # a file that only this demand reads may be damaged
@@ -465,7 +442,7 @@ class Worker:
                         raise Unavailable(f"{told}; the clone is made anew") from None
                     return told
             log.exception("internal error while evaluating demand %s", ticket.operation)
-            return internal(error)
+            return errors.internal(error)
 
     def _published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
         # Oldest first, the results of those demands that main records already. They have no answer
@@ -486,7 +463,9 @@ class Worker:
             record = recorded[ticket.operation]
             if record.outcome == "refused":
                 message = "the demand was refused, but the reason was lost; send the demand again"
-                results.append((ticket, Refused([fault("", message, code="refused")])))
+                results.append(
+                    (ticket, errors.Refused([errors.fault("", message, code="refused")]))
+                )
                 continue
             outcome: Outcome = "booked"
             if record.outcome != "changed":
@@ -586,7 +565,7 @@ class Worker:
                 return
             new = is_due or self._repository.tip() != self.snapshot.commit
             self._record_reached(pushed=new and self._carry_out_changes())
-        except FetchInterrupted:
+        except repositories.FetchInterrupted:
             self._agenda.request_fetch()  # it is still due
         except StateRepoError as error:
             self._record_failure(error)

@@ -1,14 +1,18 @@
-"""The figures of the overview: what runs, for whom, what waits, and what changed of late."""
+"""The overview: the fleet in figures, what is not ready, and what changed of late."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import groupby
 
-from demandops.views.source import Source
+from demandops.cluster.release_status import ReleaseStatus
+from demandops.model.ledger.claim import Claim, requesters_of
+from demandops.model.release import ServiceRelease
+from demandops.views.causes import Cause
+from demandops.views.source import Source, worst_word
 from demandops.web.lists import Filter, Part, Row, exactly, rows_of
 from demandops.web.time_line import BOOKED, RELEASED, Event
 
@@ -89,3 +93,49 @@ def newest(events: Sequence[Event]) -> Iterator[tuple[Event, int]]:
     for _, same in groupby(events, lambda event: event.commit or (event.summary, event.tone)):
         group = [*same]
         yield group[0], len(group)
+
+
+# The link to what a cause names.
+def link_of(cause: Cause) -> Part:
+    query = f"{exactly('cluster', cause.cluster)} {exactly('health', cause.kind)}"
+    view, params = {
+        "release": ("release", {"name": "".join(cause.releases[:1])}),
+        "releases": ("services", {"q": query}),
+        "demand": ("demands", {"q": exactly("demand", cause.what)}),
+        "override": ("overrides", {}),
+        "proposal": ("overrides", {}),
+        "": ("", {}),
+    }[cause.names]
+    return Part(cause.what, view, params)
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    application: str
+    word: str  # for a health, or the kind of the first cause
+    is_ready: bool
+
+
+def applications(source: Source, causes: Iterable[Cause], wanted: Filter) -> list[Ready]:
+    first_causes: dict[str, Cause] = {}
+    for cause in causes:
+        for application in cause.applications:
+            first_causes.setdefault(application, cause)
+    statuses = defaultdict[str, list[ReleaseStatus]](list)
+    claims_of = defaultdict[str, list[Claim]](list)
+    for name, release in source.releases.items():
+        for application in release.applications if isinstance(release, ServiceRelease) else ():
+            statuses[application].append(source.status(name))
+    for claim in source.state.ledger:
+        if claim.is_on_application:
+            claims_of[claim.subject.id].append(claim)
+    shown = []
+    for application, claims in sorted(claims_of.items()):
+        texts = {"requester": requesters_of(claims), "demand": [claim.demand for claim in claims]}
+        if wanted.matches(Row({}, texts | {"application": [application]})):
+            word, first = worst_word(statuses[application]), first_causes.get(application)
+            # what runs well may still be denied or invalid; then the cause says more
+            if first and word in ("healthy", "unknown"):
+                word = first.kind
+            shown.append(Ready(application, word, first is None))
+    return sorted(shown, key=lambda ready: (ready.is_ready, ready.application))

@@ -30,14 +30,17 @@ from demandops import __version__
 from demandops.base import settings
 from demandops.base.errors import DemandOpsError, InvalidInput
 from demandops.base.quoting import escaped, lines
-from demandops.model.config.base_model import relative
+from demandops.model.config.base_model import parse_time, relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
+from demandops.views.causes import KINDS
+from demandops.views.causes import causes as causes_of
 from demandops.views.source import WORDS, Source
-from demandops.web import fleet_map, lists, not_ready, overview, time_line
+from demandops.views.vocabulary import decision_text
+from demandops.web import fleet_map, lists, overview, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Part, Row, rows_of
-from demandops.web.release_view import explained_demand, explained_release
+from demandops.web.thing import thing
 from demandops.web.time_line import Event
 
 # ---- the views, by address ----
@@ -96,16 +99,16 @@ class ViewRequest:
 
 
 def _overview(asked: ViewRequest) -> tuple[str, Data]:
-    source = asked.source
-    causes = not_ready.causes(source, asked.filter)
+    source, wanted = asked.source, asked.filter
+    causes = [cause for cause in causes_of(source) if wanted.matches(Row({}, cause.labels))]
     moment = source.now if source.is_newest else source.entry.time
     events = [event for event in asked.events() if event.time <= moment]
     return "overview.html.j2", {
-        "figures": overview.figures(source, asked.filter, events, moment),
-        "causes": causes[:_MOST_CAUSES],
+        "figures": overview.figures(source, wanted, events, moment),
+        "causes": [(cause, overview.link_of(cause)) for cause in causes[:_MOST_CAUSES]],
         "total": len(causes),
-        "applications": not_ready.applications(source, causes, asked.filter),
-        "tones": {**WORDS, **not_ready.KINDS},
+        "applications": overview.applications(source, causes, wanted),
+        "tones": {**WORDS, **KINDS},
         "events": islice(overview.newest(events), _NEWEST),
         "overrides": source.overrides,
     }
@@ -170,6 +173,14 @@ def _overrides(asked: ViewRequest) -> tuple[str, Data]:
     return "overrides.html.j2", {"entries": entries}
 
 
+def _thing(asked: ViewRequest) -> tuple[str, Data]:
+    # `/demand?id=` and `/release?name=` are in people's bookmarks
+    kind = asked.get("kind") if asked.path == "thing" else asked.path
+    name = asked.get("id") or asked.get("name")
+    health = asked.follower.health_changes if asked.source.is_newest else ()
+    return "thing.html.j2", thing(asked.source, name, kind, health)
+
+
 VIEWS: Mapping[str, View] = {
     "/": _overview,
     "/map": lambda asked: (
@@ -177,14 +188,9 @@ VIEWS: Mapping[str, View] = {
         {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
     ),
     **{f"/{name}": _list for name in LISTS},
-    "/demand": lambda asked: (
-        "demand.html.j2",
-        {"demand": explained_demand(asked.source, asked.follower.reader(), asked.get("id"))},
-    ),
-    "/release": lambda asked: (
-        "release.html.j2",
-        {"release": explained_release(asked.source, asked.follower.reader(), asked.get("name"))},
-    ),
+    "/thing": _thing,
+    "/demand": _thing,
+    "/release": _thing,
     "/timeline": _timeline,
     "/overrides": _overrides,
 }
@@ -259,6 +265,8 @@ class Site:
             ),
             "ago": relative,
             "iso": lambda at: f"{at.astimezone(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
+            "moment": parse_time,
+            "decision": decision_text,
             "sh": shlex.quote,
         }
         self.application = Starlette(

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base import strict_yaml
-from demandops.repo.merge_check.helm import HELM_BIN
+from demandops.repo.merge_check.rendered_charts import HELM_BIN
 
 from tests.e2e.common.expected import NAMESPACE
 from tests.e2e.common.rendered import check_chart, golden

@@ -18,7 +18,7 @@ from demandops.base.errors import StateRepoError
 from demandops.cli.main import run
 from demandops.decide.state import rendered_files
 from demandops.model.demand.demand import Lease
-from demandops.serve import worker
+from demandops.serve import agenda
 from demandops.serve.approvals import approvals
 from demandops.serve.generator import Generator
 
@@ -117,7 +117,7 @@ def test_a_requester_may_have_only_so_many_proposals(
 def test_a_demand_waits_for_few_of_the_branches_that_are_pushed_for_others(
     bare: Path, url: str, person: Person, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker, "LONGEST_EVALUATION_S", 60.0)  # so all slow ones are one batch
+    monkeypatch.setattr(agenda, "LONGEST_EVALUATION_S", 60.0)  # so all slow ones are one batch
     monkeypatch.setattr(approvals, "_LONGEST_CHECK_S", -1)  # and each push takes longer
     slow = {"name": "slow", "requesters": ["station*"], "approval": "required"}
     person.policy(rules=[slow, {"name": "others", "requesters": ["vehicle*"]}])

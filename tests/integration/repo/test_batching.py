@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from demandops.serve import worker
+from demandops.serve import agenda
 
 from tests.kit import rig
 from tests.kit.rig import goal
@@ -26,7 +26,7 @@ def pushes(bare: Path) -> Path:
 @pytest.fixture(autouse=True)
 def _whole_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep a slow machine from publishing a batch in two parts."""
-    monkeypatch.setattr(worker, "LONGEST_EVALUATION_S", 60.0)
+    monkeypatch.setattr(agenda, "LONGEST_EVALUATION_S", 60.0)
 
 
 def _count(pushes: Path) -> int:

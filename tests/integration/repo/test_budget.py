@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.serve import worker
+from demandops.serve import agenda
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Ticket
 
@@ -80,7 +80,7 @@ def sender(generator: Generator, order: list[str]) -> Send:
 def test_who_sends_what_takes_too_long_holds_up_others_for_one_demand(
     bare: Path, made: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(worker, "LONGEST_EVALUATION_S", 0.0)
+    monkeypatch.setattr(agenda, "LONGEST_EVALUATION_S", 0.0)
     order: list[str] = []
     with rig.running(bare, runtime=Ticking()) as generator:
         send = sender(generator, order)
@@ -92,13 +92,13 @@ def test_who_sends_what_takes_too_long_holds_up_others_for_one_demand(
             assert rig.outcome(ticket) == "too-large"
             # what is too large is not even written to the journal
             assert ticket.journaled.result() is (made is not too_many_topics)
-        assert (generator._demands._tickets, generator.unpublished) == ({}, 0)
+        assert (generator._demands._journal.pending, generator.unpublished) == ({}, 0)
     assert order.index("other") <= (4 if made is too_many_topics else 1)
     rig.assert_sound(bare)
 
 
 def test_a_demand_that_comes_meanwhile_is_next(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker, "LONGEST_EVALUATION_S", 0.0)
+    monkeypatch.setattr(agenda, "LONGEST_EVALUATION_S", 0.0)
     order: list[str] = []
     busy = rig.Gate()
     with rig.running(bare, runtime=Ticking()) as generator:
@@ -149,7 +149,8 @@ def test_after_a_kill_in_the_middle_it_is_refused_and_leaves_the_journal(
     with caplog.at_level(logging.INFO), rig.running(str(bare), runtime=Ticking()) as generator:
         assert "resuming demand op-large from the journal" in caplog.text
         assert rig.book(generator, rig.goal(0))[0].outcome == "booked"
-        rig.wait_until(lambda: not generator._demands._tickets, "the large demand to be answered")
+        pending = generator._demands._journal.pending
+        rig.wait_until(lambda: not pending, "the large demand to be answered")
         assert generator.unpublished == 0
     assert "demand op-large ('d') from the journal: refused: too-large" in caplog.text
     assert rig.restart(bare)

@@ -21,9 +21,9 @@ def _leave(bare: Path) -> list[Path]:
     folder = bare / "demandops-pack-killed"
     folder.mkdir()
     (folder / "pack_git2_1").write_text("half of a pack")
-    pack = next((bare / "objects" / "pack").glob("*.pack"))
-    keep = pack.with_suffix(".keep")
-    keep.write_text("demandops\n")
+    index = next((bare / "objects" / "pack").glob("*.idx"))
+    keep = index.with_suffix(".keep")
+    keep.hardlink_to(index)
     return [folder, keep]
 
 

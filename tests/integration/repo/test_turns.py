@@ -47,7 +47,7 @@ def test_resumed_demands_are_answered_in_the_order_of_their_commits(
         ),
     )
     generator = Generator(str(bare), data=tmp_path, runtime=turns)
-    for operation, ticket in generator._demands._tickets.items():
+    for operation, ticket in generator._demands._journal.pending.items():
         ticket.future.add_done_callback(lambda _, operation=operation: answered.append(operation))
     turns.wait(generator.stop().done)
     assert answered == rig.operations(bare) == ["op-2", "op-1"]

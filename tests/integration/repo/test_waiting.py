@@ -82,7 +82,7 @@ def test_a_waiting_demand_whose_answer_was_lost_is_answered_again(
     received = tickets[2].received.isoformat()
     rig.leave_in_journal(tmp_path / "second", rig.journaled("op-2", goals[2], received, base))
     again = Generator(str(bare), data=tmp_path / "second", runtime=turns)
-    resumed = again._demands._tickets["op-2"].future
+    resumed = again._demands._journal.pending["op-2"].future
     turns.wait(again.stop().done)
     assert resumed.result().outcome == "waiting"
 

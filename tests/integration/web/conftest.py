@@ -12,10 +12,11 @@ import pytest
 import yaml
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
+from demandops.views.causes import Cause
+from demandops.views.causes import causes as causes_of
 from demandops.views.source import Source
-from demandops.web import not_ready
 from demandops.web.follower import Follower
-from demandops.web.lists import Filter
+from demandops.web.lists import Filter, Row
 from demandops.web.server import Site
 from starlette.testclient import TestClient
 
@@ -101,5 +102,5 @@ def look(shown: Shown) -> Look:
     return shown.look
 
 
-def causes(now: Source, text: str = "") -> list[not_ready.Cause]:
-    return not_ready.causes(now, Filter(text))
+def causes(source: Source, text: str = "") -> list[Cause]:
+    return [cause for cause in causes_of(source) if Filter(text).matches(Row({}, cause.labels))]

@@ -136,7 +136,7 @@ def test_a_lease_is_listed_with_its_end(booked: Generator, look: Look) -> None:
 def test_a_release_that_stopped_is_still_explained(booked: Generator, look: Look) -> None:
     book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
     page = look("/release", name=DETECTION)
-    assert "It does not run" in page.text and "stopped" in page.texts("td")
+    assert "It is gone since" in page.text and "stopped" in page.texts("td")
     assert look("/release", 404, name="never").text.startswith("Nothing to show")
 
 
@@ -157,7 +157,7 @@ def test_the_file_that_stops_a_release_stops_it(
     name = text.splitlines()[0].removeprefix("# ")
     person.change({name: text})
     overridden(booked)
-    assert look("/release", name=release).texts("h1") != [f"{release} unknown"]
+    assert look("/release", name=release).texts("h1") != [f"Release {release} unknown"]
     assert told.format(name) in look("/").text
     gone = {Path(path).stem for path in before - set(state.manifests())}
     assert release in gone

@@ -9,18 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.base.errors import StateRepoError
 from demandops.cluster.health import Health
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
+from demandops.views.causes import remedy_of
 from demandops.views.source import Source
 from demandops.web import fleet_map, time_line
 from demandops.web.follower import Follower
 from demandops.web.lists import Filter, page_of, rows_of
-from demandops.web.not_ready import remedy_of
-from demandops.web.release_view import explained_demand
+from demandops.web.thing import thing
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes
@@ -96,13 +95,12 @@ def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
 def test_a_failing_release_without_images_in_the_registry_names_its_maintainer(
     follower: Follower,
 ) -> None:
-    health = Health("reconciled", "ImagePullBackOff", "HelmRelease perception/x", failing=True)
     release = follower.newest.releases[DETECTION]
     assert isinstance(release, ServiceRelease)
     bare = replace(release, service=release.service.model_copy(update={"images": ()}))
-    config = follower.newest.config
-    found = remedy_of("failing", bare, config, health.object, health.reason, lambda path: None)
-    assert found[0] == "the maintainer of appdefs/object-detection-fusion"
+    object = "HelmRelease perception/x"
+    found = remedy_of(follower.newest, "failing", bare, object, "ImagePullBackOff")
+    assert found[0].startswith("the maintainer of appdefs/object-detection-fusion")
 
 
 def test_not_everything_is_ready_while_a_cluster_is_not_watched(
@@ -119,16 +117,32 @@ def test_not_everything_is_ready_while_a_cluster_is_not_watched(
     assert "Whether pods run on c-its is unknown" in page.text
 
 
-def test_an_unknown_release_is_told_with_the_commit_that_was_searched(look: Look) -> None:
+def test_each_kind_of_thing_has_a_page(look: Look) -> None:
+    for kind, name, told in (
+        ("node", "edge", "in cluster c-its"),
+        ("requester", "station00", "vehicle01/edge"),
+        ("application", "edge/object_detection_fusion", DETECTION),
+        ("connection", "vehicle00/edge", "MQTT"),
+        ("appdef", "object-detection-fusion", "edge/object_detection_fusion"),
+        ("service", "object-detection", DETECTION),
+        ("domain", "perception", "namespace perception"),
+    ):
+        page = look("/thing", kind=kind, name=name)
+        assert page.texts("h1")[0].startswith(f"{kind.capitalize()} {name} ")
+        assert told in page.text, kind
+        assert page.texts("h2")[-1] == "Time line"
+
+
+def test_an_unknown_release_is_told(look: Look) -> None:
     page = look("/release", status=404, name="od-nowhere")
-    assert "there was no release 'od-nowhere'" in page.text
+    assert "no release is called 'od-nowhere'" in page.text
 
 
 def test_an_old_bootstrap_file_and_an_object_of_no_release_are_causes(follower: Follower) -> None:
     old = OldBootstrap("c-its", "bootstrap/c-its.yaml", ("perception",), "git show …")
     left = Orphan("c-its", "Deployment", "perception", "mqtt-gone")
     now = replace(follower.newest, old_bootstraps=(old,), orphans=(left,))
-    told = {cause.what.text: cause for cause in causes(now)}
+    told = {cause.what: cause for cause in causes(now)}
     assert told.keys() == {"bootstrap/c-its.yaml", "Deployment perception/mqtt-gone"}
     assert told["bootstrap/c-its.yaml"].command == old.command
     assert told["Deployment perception/mqtt-gone"].command == left.command
@@ -271,12 +285,11 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     ledger = replace(newest.state.ledger, waiting=HashTrieMap({"later": waiting}))
     now = changed(follower, ledger=ledger)
     (cause,) = causes(now, "vehicle02")
-    assert (cause.kind, cause.what.text, cause.since) == ("waiting", "later", since)
+    assert (cause.kind, cause.what, cause.since) == ("waiting", "later", since)
     assert cause.why == "waits for room on a node"
     rows = [row for row in rows_of(now, "demands") if Filter("demand=later").matches(row)]
     assert [row.cells["health"].parts[0].text for row in rows] == ["waits for room"]
-    with pytest.raises(StateRepoError, match="'later' holds nothing, because it waits for room"):
-        explained_demand(now, follower.reader(), "later")
+    assert thing(now, "later", "demand", ())["word"] == "waiting"
 
 
 def test_the_time_line_fills_the_drawing(shown: Shown) -> None:

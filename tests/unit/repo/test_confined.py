@@ -11,16 +11,16 @@ from pathlib import Path
 import pytest
 from demandops.decide.changeset import trial_releases
 from demandops.repo.merge_check import confined_process
-from demandops.repo.merge_check import helm as helm_runs
-from demandops.repo.merge_check.helm import (
+from demandops.repo.merge_check import rendered_charts as helm_runs
+from demandops.repo.merge_check.rendered_charts import (
     HELM_BIN,
     Helm,
     Report,
+    kinds_refused,
     parsed_error,
     parsed_kinds,
     parsed_lint,
 )
-from demandops.repo.merge_check.rendered_charts import _Run
 
 from tests.kit.config import edited
 from tests.kit.http import serving
@@ -103,7 +103,7 @@ def test_output_without_end_is_a_fault(ran: Ran) -> None:
 
 
 def test_a_program_that_loops_is_a_fault(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(helm_runs, "_CPU_SECONDS", 1)
+    monkeypatch.setattr(helm_runs, "_HELM_CPU_S", 1)
     report = ran("while True: pass")
     assert not report.ended
     assert report.faults
@@ -176,6 +176,6 @@ def test_what_to_do_about_a_kind(field: str, kind: str, remedy: str) -> None:
     state = MemoryRepo(edited(DOMAINS, 'nodes: ["*"]', f'nodes: ["*"]\n    {field}')).state
     release = next(one for found in trial_releases(state.config).values() for one in found)
     group, _, name = kind.partition("/")
-    (fault,) = _Run(None, state)._kinds_refused(Report(((group, name),)), release)
+    (fault,) = kinds_refused(Report(((group, name),)), release, state.config)
     assert f"renders a {name}, which is not among the kinds of access domain 'perc" in fault.message
     assert remedy in fault.message

@@ -54,7 +54,7 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
 UNFINISHED = "demandops-pack-"  # the prefix of the folders in which packs are built
-_KEEP = b"demandops\n"  # the content of our files that keep a pack
+_KEEP = b"\xfftOc"  # how an index begins, and our files that keep a pack
 
 # An entry of a tree object: the mode, the name and the raw id.
 _ENTRY = re.compile(rb"(([0-7]+) ([^\0]+)\0.{20})", re.DOTALL)
@@ -199,7 +199,11 @@ class NewObjects(pygit2.OdbBackend):
             try:
                 pack = write_pack(folder, objects)
                 keep = self._packs / f"{pack.stem}.keep"
-                keep.write_bytes(_KEEP)  # git removes no pack that has such a file
+                # git removes no pack that has such a file; a link to what is synced costs no sync
+                try:
+                    keep.hardlink_to(pack.with_suffix(".idx"))
+                except OSError:  # the file system has no hard links, or the disk no room
+                    keep.write_bytes(_KEEP)
                 # the pack comes first, because git removes an index without a pack
                 for file in (pack, pack.with_suffix(".idx")):
                     file.replace(self._packs / file.name)
@@ -246,7 +250,9 @@ class NewObjects(pygit2.OdbBackend):
             for folder in Path(self._repo.path).glob(f"{UNFINISHED}*"):
                 shutil.rmtree(folder, ignore_errors=True)
             for keep in self._packs.glob("*.keep"):
-                if keep.read_bytes() == _KEEP:  # a person may have made one too
+                with keep.open("rb") as file:  # a person may have made one too
+                    is_ours = file.read(len(_KEEP)) == _KEEP
+                if is_ours:
                     keep.unlink()
 
     # ---- called by libgit2 ----

@@ -29,20 +29,9 @@ from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.repo.git import child_processes
+from demandops.repo.git import repository as repositories
 from demandops.repo.git.objects import NewObjects
-from demandops.repo.git.repository import (
-    MAIN,
-    TIMEOUT_S,
-    Checkout,
-    FetchInterrupted,
-    PushDenied,
-    RemoteAway,
-    StateRepository,
-    Unavailable,
-    access_error,
-    missing_main,
-    needs_push,
-)
+from demandops.repo.git.repository import MAIN, RemoteAway, StateRepository, Unavailable
 
 log = logging.getLogger("demandops")
 
@@ -284,7 +273,7 @@ class RemoteRepository(StateRepository):
     def _fetch(
         self,
         urgent: Callable[[], bool] = lambda: False,
-        timeout: float = TIMEOUT_S,
+        timeout: float = repositories.TIMEOUT_S,
     ) -> None:
         # The refspec is not in git's configuration. If it were, a push that outlives its generator
         # would move the reference.
@@ -296,7 +285,7 @@ class RemoteRepository(StateRepository):
             listing = ("ls-remote", "--quiet", "--exit-code", self._url, MAIN)
             listed = self._run_git(*listing, urgent=urgent)
             if listed.code == 2 and not listed.is_page:
-                raise missing_main(self.address)
+                raise repositories.missing_main(self.address)
         raise self._read_error("fetched", fetched)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
@@ -309,7 +298,7 @@ class RemoteRepository(StateRepository):
             with self.new.packed(commit):
                 pushed = self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except (pygit2.GitError, OSError) as error:
-            raise access_error(error, f"the clone {self._folder}") from None
+            raise repositories.access_error(error, f"the clone {self._folder}") from None
         if not pushed.took(MAIN):
             if pushed.line_of(MAIN)[0] == "[rejected]":  # git sent nothing
                 return False
@@ -371,7 +360,9 @@ class RemoteRepository(StateRepository):
         reason = ": ".join(filter(None, (pushed.line_of(reference)[1], pushed.words)))
         if not pushed.code:
             reason = f"it takes the push, but leaves {reference} where it is"
-        return PushDenied(f"{self.address} rejects the push: {reason}", is_verdict=is_verdict)
+        return repositories.PushDenied(
+            f"{self.address} rejects the push: {reason}", is_verdict=is_verdict
+        )
 
     def _read_error(self, doing: str, read: GitResult) -> Unavailable:
         if not self._is_readable:
@@ -396,7 +387,7 @@ class RemoteRepository(StateRepository):
         self,
         *command: str,
         urgent: Callable[[], bool] = lambda: False,
-        timeout: float = TIMEOUT_S,
+        timeout: float = repositories.TIMEOUT_S,
     ) -> GitResult:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
@@ -428,7 +419,7 @@ class RemoteRepository(StateRepository):
                         listener(f"{doing} {self.address}, {told} s")
                 self.while_waiting()
                 if urgent():
-                    raise FetchInterrupted("the fetch was interrupted by a demand")
+                    raise repositories.FetchInterrupted("the fetch was interrupted by a demand")
                 if took >= timeout:
                     out, err = _terminate(process)
                     break
@@ -570,8 +561,8 @@ def connect(
             f"`demandops init {address} --bare`"
         )
     if is_read_only:
-        return Checkout(path)
+        return repositories.Checkout(path)
     repository = StateRepository(path)
-    if only_read or not needs_push(address):
+    if only_read or not repositories.needs_push(address):
         return repository
     return PushedRepository(repository, folder / "clone.git", notify)

@@ -263,7 +263,7 @@ _SHALLOW = (
 
 @dataclass(frozen=True, slots=True)
 class Base:
-    commit: str
+    commit: str  # empty if there is none
     files: Mapping[str, str]
     state: State | None  # in effect at this commit; None if there never was a valid one
     valid: bool  # whether it is of all files of the commit
@@ -276,15 +276,15 @@ class Base:
         return changeset.planned_releases(self.state) if self.state else {}
 
 
-def base_of(repo: Repository, revision: str | None) -> Base | None:
+def base_of(repo: Repository, revision: str | None, files: Mapping[str, str]) -> Base:
     # ``revision`` is the merge target; by default ``origin/main``, else ``main``. If there is
-    # neither, the edit is compared with HEAD. None without a commit.
+    # neither, the edit is compared with HEAD, and without a commit with its own ``files``.
     if repo.is_empty or repo.head_is_unborn:
         if revision is not None:
             raise StateRepoError(
                 "the folder has no commit or is not a Git checkout; leave out --base"
             )
-        return None
+        return Base("", files, None, True)
     target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
     head = repo.head.peel(Commit)
     try:

@@ -87,7 +87,7 @@ def check(
     try:
         with edited_checkout.opened(folder) as (repo, tree):
             files = trees.texts(tree, edited_checkout.ROOTS)
-            start, owner = base_of(repo, base), author_of(repo)
+            start, owner = base_of(repo, base, files), author_of(repo)
     except InvalidInput as error:  # of what is no plain file
         return CheckResult(error.faults)
     edit = _Edit(files, start, now or REAL.now())
@@ -95,10 +95,10 @@ def check(
     edited = [path for path in edit.changed if _is_written_by_generator(path)]
     result = CheckResult(
         (),
-        base=start.commit if start else None,
-        base_valid=start is None or start.valid,
-        target=start.target if start else "",
-        newer=start.newer if start else 0,
+        base=start.commit or None,
+        base_valid=start.valid,
+        target=start.target,
+        newer=start.newer,
     )
     try:
         config = edit.config()
@@ -116,10 +116,10 @@ def check(
         ]
         new = changeset.planned_releases(state)
         preview = changeset.preview(
-            new if start is None else start.releases(), new, edit.before_merge(wanted), wanted
+            start.releases() if start.commit else new, new, edit.before_merge(wanted), wanted
         )
         charts = rendered_charts.render_charts(
-            state, edit.changed if start else None, {file.path for file in preview.files}
+            state, edit.changed if start.commit else None, {file.path for file in preview.files}
         )
         faults += charts.faults
         written = {file.path: file.after for file in preview.files if file.after is not None}
@@ -128,10 +128,10 @@ def check(
             faults.append(fault("", rendered_charts.NO_HELM))
         idle = override_report.warnings(override_report.override_report(state, edit.now))
         # a topic that was lacking before is not of this edit
-        old = missing_inputs(start.state) if start and start.state else ()
+        old = missing_inputs(start.state) if start.state else ()
         lacking = {(topic.application, topic.reason) for topic in old}
         booked: tuple[EntryChange, ...] | None = ()
-        if start is not None:
+        if start.commit:
             booked = None
             with suppress(InvalidInput):  # the base's bookkeeping may not be known
                 if start.state is not None:
@@ -159,9 +159,9 @@ def check(
                 *charts.warnings,
             ),
         )
-    if start is not None and start.theirs and not faults:
+    if start.theirs and not faults:
         faults += edit.faults_once_merged(start)
-    if start is not None and edited:
+    if edited:
         suggestions = _suggestions(files, start, edited, owner)
         faults += [
             fault(
@@ -259,28 +259,24 @@ def _remedy(path: str, before: str | None, after: str | None, suggestion: Sugges
 @dataclass(frozen=True, slots=True)
 class _Edit:
     files: Mapping[str, str]
-    start: Base | None
+    start: Base
     now: datetime
 
     @property
-    def before(self) -> Mapping[str, str]:
-        return self.start.files if self.start else self.files
-
-    @property
     def changed(self) -> list[str]:
-        before, after = self.before, self.files
+        before, after = self.start.files, self.files
         return sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
 
     @property
     def generated_before(self) -> dict[str, str]:
         return {
             path: text
-            for path, text in self.before.items()
+            for path, text in self.start.files.items()
             if _generated(path) and not trees.is_readme(path)
         }
 
     def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
-        files, theirs = self.generated_before, self.start.theirs if self.start else {}
+        files, theirs = self.generated_before, self.start.theirs
         for path in {*filter(_generated, theirs), *files} if theirs else ():
             # what the merge target has already is no effect of this merge
             if theirs.get(path) == wanted.get(path):
@@ -328,7 +324,7 @@ class _Edit:
         ended |= {override.name: format_time(override.end) for override in expired if override.end}
         state = State(config, replace(ledger, ended=ended), EVALUATE)
         try_configuration(state)
-        if self.start is None or self.start.state is None:
+        if self.start.state is None:
             return state
         old = self.start.state
         subjects = ledger_files.changed_subjects(old.ledger, ledger)
@@ -336,7 +332,7 @@ class _Edit:
         return replace(state, ledger=applied.ledger)
 
     def refused_claims(self, state: State) -> Iterator[Fault]:
-        old = self.start.state if self.start else None
+        old = self.start.state
         if old is not None:
             subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
             changes = changes_on(old.ledger, state.ledger, subjects)
@@ -346,7 +342,7 @@ class _Edit:
             # an override may change claims too, but not their files in the checkout
             written = {path: change for path, change in by_path.items() if path in self.files}
             for path, change in written.items():
-                if path in self.before:
+                if path in self.start.files:
                     was = ledger_files.claim_in(path, old.ledger)
                     yield from ledger_files.owner_faults(change.after, was, path)
             yield from faults_of_edit(old, state, written.values())
@@ -384,10 +380,10 @@ class _Edit:
             metadata = f"{folder}/Chart.yaml"
             folders = charts.folders(folder, self.files)
             changed = sorted(path for part in folders for path in charts.below(part, edited))
-            if not changed or metadata not in self.before:
+            if not changed or metadata not in self.start.files:
                 continue
             try:
-                data = strict_yaml.load(self.before[metadata])
+                data = strict_yaml.load(self.start.files[metadata])
             except InvalidInput:
                 continue
             if isinstance(data, dict) and data.get("version") == source.version:

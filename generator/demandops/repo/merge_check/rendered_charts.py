@@ -13,8 +13,11 @@ helm would fetch what a schema refers to; the generator's own validator checks t
 from __future__ import annotations
 
 import json
+import os
 import re
-from collections import Counter
+import shutil
+import subprocess
+import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -32,13 +35,158 @@ from demandops.base.runtime import REAL
 from demandops.decide import changeset
 from demandops.decide.changeset import trial_releases
 from demandops.decide.state import State
-from demandops.model.config.config import DOMAINS_FILE
+from demandops.model.config.config import DOMAINS_FILE, Config
 from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease
 from demandops.render.gitops import path_of, values_of
-from demandops.repo.merge_check.helm import HELM_BIN, Helm, Report
+from demandops.repo.git import child_processes
+from demandops.repo.merge_check import confined_process
 from demandops.templating import charts
 from demandops.templating.values import SchemaTask
+
+# ---- helm, which renders the charts of a pull request, whose author may be hostile ----
+#
+# Helm gets an empty home folder, no secrets of the environment, no access to a cluster or to chart
+# repositories, limits of time, memory and output, and no network where the kernel allows that.
+
+# The environment variable that names the program, instead of ``helm`` on ``PATH``.
+HELM_BIN = "HELM_BIN"
+
+# helm renders a chart in a tenth of a second. The limit of processor time ends a chart that loops,
+# also on a busy machine; the other one ends a helm that waits.
+_HELM_CPU_S = 30
+_HELM_S = 300
+_MOST_OUTPUT = 16 << 20
+# Patterns search the text of a message, whose length is the author's choice.
+_MOST_MESSAGE = 4_000
+_MOST_LINT = 100_000
+_LONGEST_SAID = 400
+_API_VERSION = re.compile(r"(?m)^[\"']?apiVersion[\"']?\s*: *[\"']?([^\s\"']+)")
+_KIND = re.compile(r"(?m)^[\"']?kind[\"']?\s*: *[\"']?([^\s\"']+)")
+_LINT = re.compile(r"\[(?P<level>ERROR|WARNING)\] (?P<text>.*)")
+_PLACE = re.compile(
+    r"(?P<path>[A-Za-z0-9][\w.-]*/(?:charts/[\w.-]+/)*templates/[\w./-]+?)(?::(?P<line>\d{1,9}))?(?=[:)\s])"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    kinds: tuple[tuple[str, str], ...] = ()  # API group and kind of each rendered object
+    faults: tuple[Fault, ...] = ()
+    warnings: tuple[Fault, ...] = ()
+    ended: bool = True  # not, if helm was stopped because of its limits
+
+
+@dataclass(frozen=True, slots=True)
+class Helm:
+    """The installed program ``helm``. Its ``home`` is a folder that holds nothing else."""
+
+    program: str
+
+    @staticmethod
+    def find() -> Helm | None:
+        program = shutil.which(os.environ.get(HELM_BIN) or "helm")
+        return Helm(str(Path(program).absolute())) if program else None
+
+    def lint(self, chart: Path, values: Path, home: Path) -> Report:
+        code, out, err = self._run(home, "lint", str(chart), f"--values={values}")
+        report = parsed_lint(out[:_MOST_LINT], chart.name)
+        if code != 0 and not report.faults:
+            return Report(faults=(parsed_error(err or out, chart.name),), ended=code > 0)
+        return report
+
+    def template(
+        self, chart: Path, values: Path, home: Path, release: str, namespace: str
+    ) -> Report:
+        code, out, err = self._run(
+            home,
+            *("template", release, str(chart), "--include-crds", "--skip-tests"),
+            *(f"--namespace={namespace}", f"--values={values}"),
+        )
+        if code != 0:
+            return Report(faults=(parsed_error(err, chart.name),), ended=code > 0)
+        return Report(tuple(dict.fromkeys(parsed_kinds(out))))
+
+    def _run(self, home: Path, *arguments: str) -> tuple[int, str, str]:
+        """Return helm's exit code, output and errors; a negative code if it was stopped."""
+        home.mkdir(exist_ok=True)
+        environment = {
+            "PATH": os.environ.get("PATH", os.defpath),
+            "HOME": str(home),
+            "TMPDIR": str(home),
+            "KUBECONFIG": os.devnull,
+            "HELM_PLUGINS": str(home / "plugins"),
+            **child_processes.mark(),
+        }
+        command = [
+            sys.executable,
+            "-IS",
+            confined_process.__file__,
+            str(_HELM_CPU_S),
+            self.program,
+        ]
+        # files, because a pipe would keep in memory whatever a hostile chart prints
+        files = home / "out", home / "err"
+        with files[0].open("wb") as out, files[1].open("wb") as err:
+            try:
+                code = subprocess.run(
+                    [*command, *arguments],
+                    cwd=home,
+                    env=environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=err,
+                    check=False,
+                    timeout=_HELM_S,
+                ).returncode
+            except subprocess.TimeoutExpired:
+                code = -1
+        if code not in (0, 1):  # a signal, or 2 from Go, for example if it gets no memory
+            limits = f"{_HELM_CPU_S} s or {confined_process.MEMORY >> 30} GiB"
+            return -1, "", f"Error: helm crashed, or took more than {limits}"
+        if files[0].stat().st_size > _MOST_OUTPUT:
+            return -1, "", f"Error: helm printed more than {_MOST_OUTPUT >> 20} MiB"
+        texts = []
+        for file in files:
+            with file.open("rb") as opened:
+                text = opened.read(_MOST_OUTPUT).decode("utf-8", "replace")
+            texts.append(text.replace(f"{home.parent}/chart/", ""))
+        return code, texts[0], texts[1]
+
+
+def parsed_kinds(out: str) -> Iterator[tuple[str, str]]:
+    for document in re.split(r"(?m)^---(?=\s|$)", out):
+        api, kind = _API_VERSION.search(document), _KIND.search(document)
+        if kind:
+            yield api[1].rpartition("/")[0] if api else "", kind[1]
+
+
+def parsed_lint(out: str, chart: str) -> Report:
+    # a fault whose template helm does not name is located at the chart's folder
+    by_level: dict[str, list[Fault]] = {"ERROR": [], "WARNING": []}
+    for entry in re.split(r"\n(?=\[|\n)", out):
+        match = _LINT.match(entry.strip())
+        if match:
+            by_level[match["level"]].append(_fault(entry.strip()[match.start("text") :], chart))
+    return Report(faults=tuple(by_level["ERROR"]), warnings=tuple(by_level["WARNING"]))
+
+
+def parsed_error(err: str, chart: str) -> Fault:
+    text = err.partition("Error: ")[2] or err
+    return _fault(text.partition("\n\nUse --debug")[0].strip(), chart)
+
+
+def _fault(text: str, chart: str) -> Fault:
+    text = text[:_MOST_MESSAGE]
+    places = [*_PLACE.finditer(text)]  # helm names first who includes, and last what is at fault
+    place = places[-1] if places else None
+    file = place["path"] if place else chart
+    line = int(place["line"]) if place and place["line"] else None
+    said = quoted(" ".join(text.split()), _LONGEST_SAID)
+    return fault("", f"helm says {said}; fix the chart or its values", line=line).within(file)
+
+
+# ---- the charts of a checkout ----
 
 MISSING = "helm is missing"
 NO_HELM = (
@@ -49,20 +197,20 @@ _SCHEMA = "values.schema.json"
 _MOST_SECONDS = 1800  # 5,000 releases take about 1,000 s
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass
 class RenderedCharts:
     # a chart that is not used, or whose lint or schema has a fault, is in neither of the two lists
     # each chart that helm tried to render, even if there were faults
-    rendered: tuple[str, ...] = ()
+    rendered: list[str] = field(default_factory=list)
     releases: int = 0
     examples: int = 0
     # chart → why helm could not try: helm or a dependency is missing, or the chart is in a registry
-    not_rendered: Mapping[str, str] = field(default_factory=dict)
-    faults: tuple[Fault, ...] = ()
-    warnings: tuple[Fault, ...] = ()
+    not_rendered: dict[str, str] = field(default_factory=dict)
+    faults: dict[Fault, None] = field(default_factory=dict)
+    warnings: dict[Fault, None] = field(default_factory=dict)
 
 
-def render_charts(
+def render_charts(  # noqa: PLR0912
     state: State, changed: Collection[str] | None, wanted: Collection[str]
 ) -> RenderedCharts:
     """Lint and render the charts of a checkout, whose state is that after the merge.
@@ -70,12 +218,14 @@ def render_charts(
     The pull request changes the paths ``changed``, None if they are unknown. With the merge, the
     generated files at the paths ``wanted`` change.
     """
-    config = state.config
+    config, result, helm = state.config, RenderedCharts(), Helm.find()
+    end = REAL.monotonic() + _MOST_SECONDS
+    # by folder, the releases, and whether each is an example
     by_folder: dict[str | None, list[tuple[ServiceRelease, bool]]] = {}
     for release in changeset.planned_releases(state).values():
         if isinstance(release, ServiceRelease):
             by_folder.setdefault(release.chart.folder, []).append((release, False))
-    edited = sorted(changed or ())
+    edited, paths = sorted(changed or ()), sorted(config.files)
     for folder, pairs in by_folder.items():
         if changed is None or not folder:  # a chart in a registry is reported as not rendered
             continue
@@ -86,162 +236,139 @@ def render_charts(
     for examples in trial_releases(config).values():
         for release in examples:
             by_folder.setdefault(release.chart.folder, []).append((release, True))
-    run = _Run(Helm.find(), state)
     for folder, pairs in by_folder.items():
-        if pairs:
-            run.render(folder, pairs)
-    return run.result()
-
-
-class _Run:
-    def __init__(self, helm: Helm | None, state: State) -> None:
-        self._helm, self._state = helm, state
-        self._files = state.config.files
-        self._paths = sorted(self._files)
-        self._end = REAL.monotonic() + _MOST_SECONDS
-        self._rendered: set[str] = set()
-        self._counts: Counter[bool] = Counter()
-        self._not_rendered: dict[str, str] = {}
-        self._faults: dict[Fault, None] = {}
-        self._warnings: dict[Fault, None] = {}
-
-    def result(self) -> RenderedCharts:
-        if self._helm is None:
-            apps = self._state.config.services.values()
-            charts = (service.chart for services in apps for service in services.values())
-            self._not_rendered = dict.fromkeys(charts, MISSING)
-        return RenderedCharts(
-            tuple(sorted(self._rendered)),
-            self._counts[False],
-            self._counts[True],
-            dict(sorted(self._not_rendered.items())),
-            tuple(self._faults),
-            tuple(self._warnings),
-        )
-
-    def render(self, folder: str | None, releases: Sequence[tuple[ServiceRelease, bool]]) -> None:
-        # the truth value says that the release is an example
-        names = dict.fromkeys(release.service.chart for release, _ in releases)
+        names = dict.fromkeys(release.service.chart for release, _ in pairs)
         if folder is None:
-            self._not_rendered |= dict.fromkeys(names, "it is in a registry")
-            return
+            result.not_rendered |= dict.fromkeys(names, "it is in a registry")
+        if folder is None or not pairs:
+            continue
         try:
-            files, missing = charts.with_libraries(folder, self._files, self._paths)
+            files, missing = charts.with_libraries(folder, config.files, paths)
             for place, path in files.items():
                 if place.rpartition("/")[2] == _SCHEMA:
-                    self._state.evaluate(self._files, SchemaTask(path))
+                    state.evaluate(config.files, SchemaTask(path))
+            if missing:
+                reason = f"its dependency {missing} is not in charts/"
+                result.not_rendered |= dict.fromkeys(names, reason)
+            elif helm:
+                with TemporaryDirectory(prefix="demandops-helm-") as scratch:
+                    _render(
+                        helm,
+                        Path(scratch),
+                        folder,
+                        files,
+                        pairs,
+                        state=state,
+                        result=result,
+                        end=end,
+                    )
         except InvalidInput as error:
-            self._faults |= dict.fromkeys(error.faults)
-            return
-        if missing:
-            reason = f"its dependency {missing} is not in charts/"
-            self._not_rendered |= dict.fromkeys(names, reason)
-        elif self._helm:
-            with TemporaryDirectory(prefix="demandops-helm-") as scratch:
-                self._render(self._helm, Path(scratch), folder, files, releases)
+            result.faults |= dict.fromkeys(error.faults)
+    if helm is None:
+        services = (each for app in config.services.values() for each in app.values())
+        result.not_rendered = dict.fromkeys((service.chart for service in services), MISSING)
+    result.rendered = sorted(set(result.rendered))
+    result.not_rendered = dict(sorted(result.not_rendered.items()))
+    return result
 
-    def _render(
-        self,
-        helm: Helm,
-        scratch: Path,
-        folder: str,
-        files: Mapping[str, str],
-        releases: Sequence[tuple[ServiceRelease, bool]],
-    ) -> None:
-        home, file = scratch / "home", scratch / "values.json"
-        chart = scratch / "chart" / folder.rpartition("/")[2]
-        try:
-            for place, path in files.items():
-                if place.rpartition("/")[2] != _SCHEMA:
-                    (chart / place).parent.mkdir(parents=True, exist_ok=True)
-                    (chart / place).write_bytes(self._files[path].encode())
-        except OSError as error:
-            message = (
-                f"{quoted(place)} cannot be written into a temporary folder for helm: "
-                f"{error.strerror}; rename it, or make room there"
-            )
-            self._faults[fault("", message).within(folder)] = None
-            return
-        linted, seen = False, set[str]()
-        for release, example in releases:
-            try:
-                data = values_of(release, self._state.config, self._state.evaluate)
-            except InvalidInput:  # only if an override holds the release's file, with older values
-                continue
-            text = json.dumps(data)
-            if f"{release.name} {text}" in seen:
-                continue
-            seen.add(f"{release.name} {text}")
-            if REAL.monotonic() > self._end:
-                message = f"is not rendered, because helm took more than {_MOST_SECONDS} s in all"
-                self._faults[fault("", f"{message}; make it simpler").within(folder)] = None
-                return
-            try:
-                self._check_libraries(folder, data)
-            except InvalidInput as error:
-                self._faults |= dict.fromkeys(error.faults)
-                return
-            file.write_text(text)
-            if not linted:
-                linted = True
-                report = helm.lint(chart, file, home)
-                self._add(report, folder, files)
-                if report.faults:
-                    return
-            self._rendered.add(release.service.chart)
-            self._counts[example] += 1
-            namespace = release.domain.namespace
-            report = helm.template(chart, file, home, release.name, namespace)
-            self._add(report, folder, files)
-            if not report.ended:
-                return
-            rules, apps = release.domain.rules, self._state.config.services
-            names = [name for name, services in apps.items() if release.key.service in services]
-            may_run = not rules or any(
-                matches(name, rule.applications) for rule in rules for name in names
-            )
-            if not example or may_run:
-                self._faults |= dict.fromkeys(self._kinds_refused(report, release))
 
-    def _check_libraries(self, folder: str, values: Mapping[str, Any]) -> None:
-        """Check the values of the charts in ``charts/`` against their schemas, as Helm does."""
-        above = charts.merged(charts.defaults(folder, self._files), values)
-        for dependency in charts.dependencies(folder, self._files):
-            own = above.get(dependency.alias)
-            if dependency.optional or not isinstance(own, dict | None):
-                continue
-            library = dependency.folder or f"{folder}/charts/{dependency.name}"
-            try:
-                charts.defaults(library, self._files)
-            except InvalidInput:  # YAML that only Helm reads, for example with anchors
-                continue
-            inner = {"global": above.get("global", {}), **(own or {})}
-            schema = f"{library}/{_SCHEMA}"
-            if schema in self._files:
-                self._state.evaluate(
-                    self._files, SchemaTask(schema, inner, f"{folder}/values.yaml")
-                )
-            if dependency.folder:
-                self._check_libraries(library, inner)
+def _render(  # noqa: PLR0913 - a chart, what to render it with, and where the result goes
+    helm: Helm,
+    scratch: Path,
+    folder: str,
+    files: Mapping[str, str],
+    releases: Sequence[tuple[ServiceRelease, bool]],
+    *,
+    state: State,
+    result: RenderedCharts,
+    end: float,
+) -> None:
+    home, file, config = scratch / "home", scratch / "values.json", state.config
+    chart = scratch / "chart" / folder.rpartition("/")[2]
+    try:
+        for place, path in files.items():
+            if place.rpartition("/")[2] != _SCHEMA:
+                (chart / place).parent.mkdir(parents=True, exist_ok=True)
+                (chart / place).write_bytes(config.files[path].encode())
+    except OSError as error:
+        message = f"{quoted(place)} cannot be written into a temporary folder for helm: "
+        message += f"{error.strerror}; rename it, or make room there"
+        raise InvalidInput.at("", message, file=folder) from None
 
-    def _add(self, report: Report, folder: str, files: Mapping[str, str]) -> None:
-        for faults, into in ((report.faults, self._faults), (report.warnings, self._warnings)):
+    def add(report: Report) -> bool:
+        for faults, into in ((report.faults, result.faults), (report.warnings, result.warnings)):
             for said in faults:
                 place = said.file.partition("/")[2]  # helm's path starts with the chart's name
                 into[said.within(files.get(place, f"{folder}/{place}".rstrip("/")))] = None
+        return not report.faults
 
-    def _kinds_refused(self, report: Report, release: ServiceRelease) -> Iterator[Fault]:
-        domain = release.domain
-        allowed = {(entry.group, entry.kind) for entry in domain.allowed_kinds}
-        for group, kind in report.kinds:
-            if (group, kind) not in allowed:
-                file = self._state.config.file_of(DOMAINS_FILE, domain.name)
-                message = (
-                    f"renders a {kind}, which is not among the kinds of access domain "
-                    f"'{domain.name}', so the domain's cluster would refuse the object; "
-                    f"{domain.how_to_allow(kind, file)}, or leave the object out"
-                )
-                yield fault("", message).within(str(release.chart.folder))
+    linted, seen = False, set[str]()
+    for release, is_example in releases:
+        try:
+            data = values_of(release, config, state.evaluate)
+        except InvalidInput:  # only if an override holds the release's file, with older values
+            continue
+        text = json.dumps(data)
+        if f"{release.name} {text}" in seen:
+            continue
+        seen.add(f"{release.name} {text}")
+        if REAL.monotonic() > end:
+            message = f"is not rendered, because helm took more than {_MOST_SECONDS} s in all; "
+            raise InvalidInput.at("", f"{message}make it simpler", file=folder)
+        _check_libraries(state, folder, data)
+        file.write_text(text)
+        if not linted and not add(helm.lint(chart, file, home)):
+            return
+        linted = True
+        result.rendered.append(release.service.chart)
+        result.examples += is_example
+        result.releases += not is_example
+        report = helm.template(chart, file, home, release.name, release.domain.namespace)
+        add(report)
+        if not report.ended:
+            return
+        rules, apps = release.domain.rules, config.services
+        names = [name for name, services in apps.items() if release.key.service in services]
+        may_run = not rules or any(
+            matches(name, rule.applications) for rule in rules for name in names
+        )
+        if not is_example or may_run:
+            result.faults |= dict.fromkeys(kinds_refused(report, release, config))
+
+
+def _check_libraries(state: State, folder: str, values: Mapping[str, Any]) -> None:
+    """Check the values of the charts in ``charts/`` against their schemas, as Helm does."""
+    files = state.config.files
+    above = charts.merged(charts.defaults(folder, files), values)
+    for dependency in charts.dependencies(folder, files):
+        own = above.get(dependency.alias)
+        if dependency.optional or not isinstance(own, dict | None):
+            continue
+        library = dependency.folder or f"{folder}/charts/{dependency.name}"
+        try:
+            charts.defaults(library, files)
+        except InvalidInput:  # YAML that only Helm reads, for example with anchors
+            continue
+        inner = {"global": above.get("global", {}), **(own or {})}
+        schema = f"{library}/{_SCHEMA}"
+        if schema in files:
+            state.evaluate(files, SchemaTask(schema, inner, f"{folder}/values.yaml"))
+        if dependency.folder:
+            _check_libraries(state, library, inner)
+
+
+def kinds_refused(report: Report, release: ServiceRelease, config: Config) -> Iterator[Fault]:
+    domain = release.domain
+    allowed = {(entry.group, entry.kind) for entry in domain.allowed_kinds}
+    for group, kind in report.kinds:
+        if (group, kind) not in allowed:
+            file = config.file_of(DOMAINS_FILE, domain.name)
+            message = (
+                f"renders a {kind}, which is not among the kinds of access domain "
+                f"'{domain.name}', so the domain's cluster would refuse the object; "
+                f"{domain.how_to_allow(kind, file)}, or leave the object out"
+            )
+            yield fault("", message).within(str(release.chart.folder))
 
 
 # ---- whether what the generator writes is what Kubernetes takes ----

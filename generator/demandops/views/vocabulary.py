@@ -1,0 +1,138 @@
+"""The vocabulary of docs/json.md: what rows and JSON call the parts of each thing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict
+from datetime import datetime
+from typing import Any
+
+from demandops.base.naming import Subject
+from demandops.decide.bookkeeping import versions_asked
+from demandops.model.config.base_model import plain
+from demandops.model.config.override import Override, format_time
+from demandops.model.config.registry import ImagePin
+from demandops.model.demand.demand import Lease
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import Claim
+from demandops.model.ledger.ledger import Ledger
+from demandops.model.release import Release, ServiceRelease
+from demandops.render.gitops import path_of
+from demandops.repo.history.commit_log import LogEntry
+
+Json = dict[str, Any]
+
+
+def time_data(moment: datetime | None) -> str | None:
+    return format_time(moment) if moment else None
+
+
+def time_text(time: str) -> str:
+    return f"{time[:19].rstrip('Z').replace('T', ' ')} UTC"
+
+
+def subject_data(subject: Subject) -> Json:
+    return {"kind": subject.kind.value[:-1], "id": subject.id}
+
+
+def subject_text(item: Json) -> str:
+    return "{kind} {id}".format(**item["subject"])
+
+
+def lease_data(lease: Lease | None) -> Json | None:
+    if lease is None:
+        return None
+    return {
+        "seconds": lease.seconds,
+        "slack": lease.slack,
+        "until": time_data(lease.until) if lease.has_started else None,
+    }
+
+
+def claim_data(claim: Claim) -> Json:
+    app = claim.application if claim.is_on_application else None
+    return {
+        "subject": subject_data(claim.subject),
+        "demand": claim.demand,
+        "request": claim.request,
+        "version": (app and app.version) or None,
+        "place": plain(app.place) if app and app.place else None,
+        "services": dict(sorted(app.services.items())) if app and app.services else None,
+        "reads": {id: [*outputs] for id, outputs in app.read_outputs.items()} if app else {},
+        "held_for": {id: [*outputs] for id, outputs in app.held_for.items()} if app else {},
+        "requesters": list(claim.requesters),
+        "since": time_data(claim.booked),
+        "lease": lease_data(claim.lease),
+        "file": claim_files.path_of(claim.key),
+    }
+
+
+def place_data(release: Release) -> Json:
+    return {
+        "what": release.description,
+        "cluster": release.node.cluster,
+        "domain": release.domain.name,
+        "namespace": release.domain.namespace,
+        "node": release.node.id,
+    }
+
+
+def release_data(release: Release) -> Json:
+    return {"name": release.name, **place_data(release), "file": path_of(release)}
+
+
+def version_data(release: Release, ledger: Ledger) -> Json:
+    if not isinstance(release, ServiceRelease):
+        return {"version": None, "application_version": None, "versions_asked": {}}
+    return {
+        "version": release.chart.version,
+        "application_version": release.version.name or None,
+        "versions_asked": versions_asked(release, ledger),
+    }
+
+
+def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
+    names = override.effects() if effects is None else effects
+    return {
+        "name": override.name,
+        "file": override.path,
+        "effects": {name: _plain(getattr(override, name)) for name in names},
+        "priority": override.priority,
+        "owner": override.owner,
+        "until": time_data(override.end),
+        "reason": override.reason,
+    }
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401
+    # as the override's file has it, including the nulls of a patch
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value
+
+
+def decision_text(decision: Json) -> str:
+    unnamed = ", by whom Git does not say," if decision["outcome"] == "approved" else ""
+    who = f" by {decision['by']}" if decision["by"] else unnamed
+    reason = f": {decision['reason']}" if decision["reason"] else ""
+    return f"{decision['outcome']}{who} at {time_text(decision['time'])}{reason}"
+
+
+def commit_data(entry: LogEntry) -> Json:
+    answer = entry.answer
+    return {
+        "commit": entry.commit,
+        "time": time_data(entry.time),
+        "author": entry.author,
+        "summary": entry.summary,
+        "why": entry.why or None,
+        "operation": entry.first("Operation") or None,
+        "operation_id": entry.first("Operation-Id") or None,
+        "request": entry.first("Request-Id") or None,
+        "demands": entry.trailers.get("Demand-Id", []),
+        "requesters": entry.trailers.get("Requester", []),
+        "applications": entry.trailers.get("Application", []),
+        "connections": entry.trailers.get("Connection", []),
+        "render_version": entry.first("Render-Version") or None,
+        "decision": asdict(answer) | {"time": time_data(answer.time)} if answer else None,
+    }
