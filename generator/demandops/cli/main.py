@@ -71,7 +71,7 @@ COMMANDS = {
     "version": ("program", "Print the versions of the program and of its formats."),
     "watch": ("queries.live", "Show releases, demands and the latest commits live."),
     "web": ("queries.live", "Show the state repo on a web page."),
-    "why": ("queries.why", "Explain why something runs or ran."),
+    "why": ("queries.why", "Explain why something runs or ran, and who decided it."),
 }
 
 # Other names of commands.

@@ -119,6 +119,8 @@ def revert(commit: str, options: Options) -> None:
         if entry.by_generator or booked:
             who = "a generator made it" if entry.by_generator else f"it changes {booked[0]}"
             ways = [f"demandops release {shlex.quote(demand)}" for demand in demands]
+            if follows := entry.first("Follows"):  # it carries out what a person committed
+                ways.append(f"demandops revert {follows[:10]}")
             ways.append(f"demandops rollback {id[:10]}~1 -m REASON")
             message = (
                 f"{id[:10]} is not undone by a revert, because {who}; run: {' or '.join(ways)}"

@@ -26,7 +26,12 @@ from demandops.cli import json_output, target
 from demandops.cli.json_output import Json
 from demandops.cli.output import done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.diff import release_lines
-from demandops.decide.changeset import ReleaseChange, describe_change, planned_releases
+from demandops.decide.changeset import (
+    FileChange,
+    ReleaseChange,
+    describe_change,
+    planned_releases,
+)
 from demandops.decide.planning.overrides import suspended_claims
 from demandops.decide.state import State
 from demandops.model.ledger.claim import requesters_of
@@ -129,8 +134,7 @@ def consequence(
     ``claims`` are those that are released or reduced, ``who`` are their requesters, or those of the
     releases that stop.
     """
-    for line in release_lines([*releases][:_MOST_SHOWN]):
-        yield fitted(f"  {line}", terminal_width())
+    yield from (f"  {line}" for line in release_lines([*releases][:_MOST_SHOWN]))
     if len(releases) > _MOST_SHOWN:
         yield f"  and {count(len(releases) - _MOST_SHOWN, 'more release')} (-o json lists all)"
     stopped = sum(release.change == "stop" for release in releases)
@@ -203,6 +207,7 @@ def commit(
     claims = [claim for claim, _ in suspended_claims(after) if claim.key not in suspended]
     of_command, lines = more(before.state, after)
     told = [f"{summary} ({', '.join(files)})", *lines, *consequence(changes, who)]
+    told = [fitted(line, terminal_width()) for line in told]
     data: Json = {
         "outcome": "would-change",
         "commit": None,
@@ -214,8 +219,11 @@ def commit(
         **of_command,
     }
     if options.dry_run:
-        texts = (text for text in files.values() if text is not None and len(files) == 1)
-        shown = [f"    {line}" for text in texts for line in text.splitlines()]
+        current, shown = repo.file_reader(), list[str]()
+        for path, content in files.items():
+            file = FileChange(path, current(path), content)
+            diff = file.diff() if file.before else (content or "").splitlines()
+            shown += [f"    {line}" for line in diff]
         json_output.show(options.output, data, [*told, *shown, "nothing was changed"])
         return
     for line in told if options.output == "text" else ():
