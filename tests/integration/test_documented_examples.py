@@ -104,7 +104,7 @@ def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> Non
 def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:
     listed = data("placement.md", f"{_EDGE} capabilities")["nodes"]
     repo = MemoryRepo(with_nodes(listed) | brokers(*sorted(node["id"] for node in listed)))
-    goal = data("placement.md", "apiVersion: demandops/v1\nkind: Dem")
+    goal = yaml.safe_load((DOCS.parent / "examples" / "placement" / "demand.yaml").read_text())
     start = "application 'object_detection_fusion' is placed on 'edge-north', "
     assert repo.send(goal).placed == (block("placement.md", start + "the nearest"),)
     goal["positions"][0]["y"] = 0
@@ -228,9 +228,9 @@ def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
 
 
 def test_the_node_in_several_domains_of_the_documentation() -> None:
-    (policy,) = (text for text in blocks("policy.md") if "name: guests" in text)
+    policy = (DOCS.parent / "examples" / "policy" / "node-in-two-domains.yaml").read_text()
     edge = data("policy.md", "nodes:\n  - id: edge")["nodes"]
-    repo = MemoryRepo(with_nodes(edge) | {POLICY: _DOMAINS + policy})
+    repo = MemoryRepo(with_nodes(edge) | {POLICY: policy})
 
     def folders(who: str, node: str = "edge") -> set[str]:
         releases = repo.decide(put(who, who, node=node, connect="none")).releases
@@ -245,7 +245,10 @@ def test_the_node_in_several_domains_of_the_documentation() -> None:
 
 
 def two_versions() -> list[dict[str, Any]]:
-    return [data("versions.md", f"kind: Demand\ndemand: {who}00") for who in ("station", "vehicle")]
+    folder = DOCS.parent / "examples" / "versions"
+    return [
+        yaml.safe_load((folder / f"{who}00.yaml").read_text()) for who in ("station", "vehicle")
+    ]
 
 
 def test_the_versions_of_the_documentation_are_an_update_and_back() -> None:

@@ -71,7 +71,7 @@ BUILD = Path(__file__).parents[2] / "build" / "page"
 VIEWS = [
     *("", "map", "map?q=vehicle00", "demands", "services", "connections", "leases", "timeline"),
     *("timeline?at=HEAD~2", f"release?name={FAILING}", "demand?id=vehicle01-to-cloud"),
-    "overrides",
+    *("overrides", "thing?kind=node&name=edge", "thing?kind=requester&name=vehicle00"),
 ]
 SERIOUS = ("serious", "critical")
 
@@ -262,15 +262,15 @@ def test_the_page_follows_again_when_its_server_is_back(browser: Browser, fleet:
     server.close()
 
 
-def test_a_demand_that_ended_is_not_shown_any_longer(browser: Browser, fleet: Story) -> None:
+def test_a_demand_that_ended_is_told_at_once(browser: Browser, fleet: Story) -> None:
     book(fleet.generator, leased("short", "vehicle03"))
     fleet.wait_followed()
     visit = Visit(browser, fleet.url)
     page = visit.open("/demand?id=short")
-    expect(page.locator("h1")).to_have_text("Demand short")
+    expect(page.locator("h1")).to_have_text("Demand short held")
     expect(page.locator("#live")).to_have_text("live")
     book(fleet.generator, released("short", "vehicle03"))
-    expect(page.locator("h1")).to_have_text("Nothing to show")
+    expect(page.locator("h1")).to_have_text("Demand short gone")
     visit.close()
 
 

@@ -1,4 +1,4 @@
-"""Tables cut no word at any width. If the output is not a terminal, each row is one line."""
+"""Tables cut no word at any width. If they are to be whole, each row is one line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rich.cells import cell_len
 
 from tests.kit.chance import examples
 
-COLUMNS = Column("Name"), Column("State", 1), Column("Reason", 2, wraps=True), Column("Since", 3)
+COLUMNS = Column("Name"), Column("State", 1), Column("Reason", 2), Column("Since", 3)
 NAME = "of-edge-object-detection-fusion-cf7e0180a8bb"
 ROWS = [(NAME, "failing", "Helm install failed: timed out waiting", ["2h ago", "b"])]
 WORDS = st.text("abc 車-/", max_size=40)
@@ -17,10 +17,10 @@ WORDS = st.text("abc 車-/", max_size=40)
 
 def test_text_wraps_and_what_matters_least_is_left_out() -> None:
     assert Table(COLUMNS, ROWS).lines(80) == [
-        "NAME                                          STATE    REASON             SINCE",
-        "of-edge-object-detection-fusion-cf7e0180a8bb  failing  Helm install       2h ago",
-        "                                                       failed: timed out  b",
-        "                                                       waiting",
+        "NAME                                          STATE    REASON          SINCE",
+        "of-edge-object-detection-fusion-cf7e0180a8bb  failing  Helm install    2h ago, b",
+        "                                                       failed: timed",
+        "                                                       out waiting",
     ]
     assert Table(COLUMNS, ROWS).lines(60) == [
         "NAME                                          STATE",
@@ -30,8 +30,8 @@ def test_text_wraps_and_what_matters_least_is_left_out() -> None:
     assert Table(COLUMNS, ROWS).lines(20)[1] == NAME, "a name is whole even if it is too wide"
 
 
-def test_elsewhere_a_row_is_one_line() -> None:
-    _, row = Table(COLUMNS, ROWS).lines(None)
+def test_a_row_of_a_whole_table_is_one_line() -> None:
+    _, row = Table(COLUMNS, ROWS, whole=True).lines(20)
     assert row.endswith("  2h ago, b")
 
 
@@ -43,7 +43,7 @@ def test_an_empty_table_says_so() -> None:
 @examples(80)
 def test_no_word_is_ever_cut(rows: list[tuple[str, str, list[str]]], width: int) -> None:
     """The first column is always shown whole. Another column is left out if it does not fit."""
-    columns = (Column("Name", wraps=True), Column("State", 1, wraps=True), Column("Since", 2))
+    columns = (Column("Name"), Column("State", 1), Column("Since", 2))
     table = Table(columns, rows)
     shown = table.lines(width)
     told = " ".join(shown).split()

@@ -3,34 +3,34 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
-from datetime import datetime
 from functools import wraps
 from typing import Any
 
 import click
 
 from demandops.base.errors import DemandOpsError, InvalidInput, fault
-from demandops.base.naming import Subject
 from demandops.base.quoting import json_escaped, lines
 from demandops.cli.output import painted, print_lines, terminal_width
 from demandops.cli.table import Table
-from demandops.decide.bookkeeping import versions_asked
-from demandops.model.config.base_model import plain
-from demandops.model.config.override import Override, format_time
-from demandops.model.config.registry import ImagePin
-from demandops.model.demand.demand import Lease
-from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import Claim
-from demandops.model.ledger.ledger import Ledger
-from demandops.model.release import Release, ServiceRelease
-from demandops.render.gitops import path_of
-from demandops.repo.history.commit_log import LogEntry
+from demandops.views.vocabulary import Json
 
-Json = dict[str, Any]
 Command = Callable[..., Any]
+
+# The width of tables elsewhere than on a terminal.
+_NARROW = 80
+_PATH = "jsonpath="
+_STEP = re.compile(r"\.?\*|\.?([\w-]+)|\[(\*|-?\d+)\]|\[(['\"])(.*?)\3\]")
+
+
+class _Format(click.Choice[str]):
+    def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        if value.startswith(_PATH) and any(choice.startswith(_PATH) for choice in self.choices):
+            return value
+        return super().convert(value, param, ctx)
 
 
 def output_formats(*formats: str) -> Callable[[Command], Command]:
@@ -41,7 +41,7 @@ def output_formats(*formats: str) -> Callable[[Command], Command]:
     option = click.option(
         "-o",
         "--output",
-        type=click.Choice(formats),
+        type=_Format(formats),
         default="text",
         show_default=True,
         help=description,
@@ -69,10 +69,13 @@ def show(output: str, data: object, text: Iterable[str | Table]) -> None:
     if output == "json":
         print_json(data)
         return
+    if output.startswith(_PATH):
+        click.echo(lines(filled(output.removeprefix(_PATH), data)))
+        return
     printed: list[str] = []
     for part in text:
         if isinstance(part, Table):
-            printed += part.lines(terminal_width(), painted)
+            printed += part.lines(terminal_width() or _NARROW, painted)
         else:
             printed += lines(part).split("\n")
     print_lines(printed)
@@ -93,112 +96,61 @@ def faults_of(error: DemandOpsError) -> list[Json]:
     return [asdict(fault) for fault in dict.fromkeys(faults)]
 
 
-def time_data(moment: datetime | None) -> str | None:
-    return format_time(moment) if moment else None
+# ---- templates of JSON as kubectl has them ----
 
 
-def time_text(time: str) -> str:
-    return f"{time[:19].rstrip('Z').replace('T', ' ')} UTC"
+def filled(template: str, data: object) -> str:
+    """Fill ``{.items[*].name}``, ``{.items[0]['name']}``, ``{range …}…{end}`` and ``{"\\n"}``."""
+    parts = re.split(r"\{((?:\"[^\"]*\"|[^{}\"])*)\}", template)
+    # every second part stands in braces; a template without braces is one expression
+    tokens = [("{" if at % 2 else "", part) for at, part in enumerate(parts)]
+    return _filled([("{", template)] if len(parts) == 1 else tokens, data)
 
 
-def subject_data(subject: Subject) -> Json:
-    return {"kind": subject.kind.value[:-1], "id": subject.id}
+def _filled(tokens: list[tuple[str, str]], data: object) -> str:
+    text, at = "", 0
+    while at < len(tokens):
+        brace, part = tokens[at]
+        at += 1
+        if not brace:
+            text += part
+        elif part.startswith('"'):
+            text += json.loads(part)
+        elif part.startswith("range "):
+            ends = [n for n in range(at, len(tokens)) if tokens[n] == ("{", "end")]
+            if not ends:
+                raise click.UsageError("--output: {range …} has no {end}")
+            for value in _values(part.removeprefix("range "), data):
+                text += _filled(tokens[at : ends[0]], value)
+            at = ends[0] + 1
+        else:
+            values = _values(part, data)
+            text += " ".join(v if isinstance(v, str) else json_text(v) for v in values)
+    return text
 
 
-def lease_data(lease: Lease | None) -> Json | None:
-    if lease is None:
-        return None
-    return {
-        "seconds": lease.seconds,
-        "slack": lease.slack,
-        "until": time_data(lease.until) if lease.has_started else None,
-    }
-
-
-def claim_data(claim: Claim) -> Json:
-    app = claim.application if claim.is_on_application else None
-    return {
-        "subject": subject_data(claim.subject),
-        "demand": claim.demand,
-        "request": claim.request,
-        "version": (app and app.version) or None,
-        "place": plain(app.place) if app and app.place else None,
-        "services": dict(sorted(app.services.items())) if app and app.services else None,
-        "reads": {id: [*outputs] for id, outputs in app.read_outputs.items()} if app else {},
-        "held_for": {id: [*outputs] for id, outputs in app.held_for.items()} if app else {},
-        "requesters": list(claim.requesters),
-        "since": time_data(claim.booked),
-        "lease": lease_data(claim.lease),
-        "file": claim_files.path_of(claim.key),
-    }
-
-
-def place_data(release: Release) -> Json:
-    return {
-        "what": release.description,
-        "cluster": release.node.cluster,
-        "domain": release.domain.name,
-        "namespace": release.domain.namespace,
-        "node": release.node.id,
-    }
-
-
-def release_data(release: Release) -> Json:
-    return {"name": release.name, **place_data(release), "file": path_of(release)}
-
-
-def version_data(release: Release, ledger: Ledger) -> Json:
-    if not isinstance(release, ServiceRelease):
-        return {"version": None, "application_version": None, "versions_asked": {}}
-    return {
-        "version": release.chart.version,
-        "application_version": release.version.name or None,
-        "versions_asked": versions_asked(release, ledger),
-    }
-
-
-def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
-    names = override.effects() if effects is None else effects
-    return {
-        "name": override.name,
-        "file": override.path,
-        "effects": {name: _plain(getattr(override, name)) for name in names},
-        "priority": override.priority,
-        "owner": override.owner,
-        "until": time_data(override.end),
-        "reason": override.reason,
-    }
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401
-    # as the override's file has it, including the nulls of a patch
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value
-
-
-def decision_text(decision: Json) -> str:
-    unnamed = ", by whom Git does not say," if decision["outcome"] == "approved" else ""
-    who = f" by {decision['by']}" if decision["by"] else unnamed
-    reason = f": {decision['reason']}" if decision["reason"] else ""
-    return f"{decision['outcome']}{who} at {time_text(decision['time'])}{reason}"
-
-
-def commit_data(entry: LogEntry) -> Json:
-    answer = entry.answer
-    return {
-        "commit": entry.commit,
-        "time": time_data(entry.time),
-        "author": entry.author,
-        "summary": entry.summary,
-        "why": entry.why or None,
-        "operation": entry.first("Operation") or None,
-        "operation_id": entry.first("Operation-Id") or None,
-        "request": entry.first("Request-Id") or None,
-        "demands": entry.trailers.get("Demand-Id", []),
-        "requesters": entry.trailers.get("Requester", []),
-        "applications": entry.trailers.get("Application", []),
-        "connections": entry.trailers.get("Connection", []),
-        "render_version": entry.first("Render-Version") or None,
-        "decision": asdict(answer) | {"time": time_data(answer.time)} if answer else None,
-    }
+def _values(expression: str, data: object) -> list[Any]:
+    values: list[Any]
+    values, at, path = [data], 0, expression.strip().lstrip("$@").removesuffix(".")
+    while at < len(path):
+        step = _STEP.match(path, at)
+        if step is None:
+            raise click.UsageError(f"--output: the path {expression} is not valid at {path[at:]}")
+        at, name, index = step.end(), step[1] or step[4], step[2]
+        if name is not None:
+            having = [value[name] for value in values if isinstance(value, dict) and name in value]
+            if values and not having:
+                keys = {key for value in values if isinstance(value, dict) for key in value}
+                raise click.UsageError(
+                    f"--output: there is no '{name}' in {expression}; there is "
+                    f"{', '.join(sorted(keys)) or 'nothing'}"
+                )
+            values = having
+        elif index in (None, "*"):
+            inner = (v.values() if isinstance(v, dict) else v for v in values)
+            values = [each for group in inner if not isinstance(group, str) for each in group or ()]
+        else:
+            lists = (value for value in values if isinstance(value, list))
+            number = int(index)
+            values = [each[number] for each in lists if -len(each) <= number < len(each)]
+    return values

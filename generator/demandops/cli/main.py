@@ -23,6 +23,7 @@ from demandops import __version__
 from demandops.base.errors import DemandOpsError, InvalidInput, Unsound, suggestion
 from demandops.base.quoting import OneLineFormatter, one_line
 from demandops.cli.output import OutputLost, done, errors, open_streams, show_slow
+from demandops.repo.git import child_processes
 
 # The package of each command's module, and the short help, which `--help` shows without importing
 # the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.
@@ -40,7 +41,7 @@ COMMANDS = {
     ),
     "diff": ("queries.diff", "Show the differences between two commits."),
     "drain": ("changes.edit", "Take a node out of use: nothing new is placed there."),
-    "get": ("queries.get", "List demands, nodes, services, overrides and so on."),
+    "get": ("queries.get", "List demands, releases, nodes, overrides and so on."),
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
     "log": ("queries.log", "List the commits of the state repo, newest first."),
@@ -185,9 +186,7 @@ class _LazyGroup(click.Group):
             ctx.fail(f"there is no command '{args[0]}'{_hint(args[0])}")
         name, command, arguments = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
-            from demandops.repo.git import remote_repository  # noqa: PLC0415 - it imports pygit2
-
-            remote_repository.listen(show_slow)
+            child_processes.listeners[:] = [show_slow]
         return name, load(name) if name else command, arguments
 
 

@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 import textwrap
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
@@ -177,15 +177,6 @@ def read_by(parse: Callable[[str], Any]) -> Callable[..., Any]:
             raise click.BadParameter(str(error)) from None
 
     return value
-
-
-def version_lines(data: Mapping[str, Any]) -> list[str]:
-    # of what `json_output.version_data` returns
-    asked = data["versions_asked"].items()
-    return [
-        data["application_version"] or data["version"] or "",
-        *(f"{version} requested by {', '.join(requesters)}" for version, requesters in asked),
-    ]
 
 
 def show_slow(text: str) -> None:  # an empty text clears the line

@@ -14,7 +14,7 @@ from demandops.base.errors import StateRepoError, fault
 from demandops.base.runtime import REAL
 from demandops.cli import target
 from demandops.cli.authoring import schema
-from demandops.cli.json_output import Json, output_option, show
+from demandops.cli.json_output import output_option, show
 from demandops.cli.output import busy, done, errors, progress
 from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader
@@ -24,6 +24,7 @@ from demandops.repo.upgrade import Upgrade, UpgradeRequest
 from demandops.serve.journal import drop as drop_demand
 from demandops.serve.journal import find_journals
 from demandops.templating.evaluator import processor_time
+from demandops.views.vocabulary import Json
 
 # ---- ``demandops init``: a new state repo ----
 

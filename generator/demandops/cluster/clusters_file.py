@@ -56,9 +56,10 @@ class ClusterAccess(FrozenModel):
         """Return the cluster's API for objects of any kind. The access must have a kubeconfig."""
         from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
 
-        return client.CustomObjectsApi(
-            config.new_client_from_config(str(self.kubeconfig), self.context)
-        )
+        settings = client.Configuration()
+        settings.retries = False  # the library would warn of each, and the callers try again
+        config.load_kube_config(str(self.kubeconfig), self.context, settings)
+        return client.CustomObjectsApi(client.ApiClient(settings))
 
 
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
@@ -79,7 +80,11 @@ def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no
 
 
 def reason_of(error: Exception) -> str:
-    # of an error of the library
+    # of an error of the library, which wraps those of the network several times
+    while isinstance(inner := getattr(error, "reason", None) or error.__cause__, Exception):
+        error = inner
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
     reason = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
     return reason.splitlines()[0][:300]
 

@@ -131,7 +131,7 @@ class ReleaseStatus:
         return self.health.state if self.seen or self.health.object else "unknown"
 
 
-_NO_ACCESS = ReleaseStatus(Health("waiting", "no access to this cluster"))
+_NO_ACCESS = ReleaseStatus(Health("waiting"))
 # Returns the paths in which two commits differ, if that is known.
 ChangedPaths = Callable[[str, str], "Collection[str] | None"]
 

@@ -6,7 +6,7 @@ whenever it is shown, and is stored nowhere.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -30,54 +30,17 @@ Json: TypeAlias = dict[str, Any]
 
 def bookkeeping(world: World) -> Json:
     active = without_suspended(world)
-    services, connections = dict[str, Json](), dict[str, Json]()
-    for release in (plan(world, key) for key in all_keys(world)):
-        if not isinstance(release, ServiceRelease):
-            continue
-        inputs = {
-            role: {topic.topic: set[str]() for topic in topics}
-            for role, topics in release.inputs.items()
-        }
-        for claim in claims_of(release, active.ledger):
-            for role, topic in demanded_inputs(active, release, claim.application):
-                if topic in inputs[role]:  # a claim that a person wrote may name another topic
-                    inputs[role][topic].update(claim.requesters)
-        services[release.name] = {
-            "applications": list(release.applications),
-            "service": release.key.service,
-            "node": release.node.id,
-            "source": release.key.source,
-            "source_topic": release.key.topic,
-            "version": release.chart.version,
-            "application_version": release.version.name or None,  # in registry/versions.yaml
-            "versions_asked": versions_asked(release, active.ledger),
-            "parameters": dict(release.parameters),
-            "inputs": {role: _sorted(topics) for role, topics in inputs.items()},
-            "requesters": list(release.requesters),
-        }
-    for id in world.ledger.subjects(SubjectKind.CONNECTION):
-        first, claims = active.ledger.connection(id), active.ledger.connection_claims(id)
-        if first is None or not claims:
-            continue
-        routes = connection_topics(claims)
-        requesters = {route.source: set[str]() for route in routes}
-        listed: dict[str, set[str]] = {}
-        for claim in claims:
-            for route in claim.connection.topics:
-                requesters[route.source].update(claim.requesters)
-                if route.listed:
-                    listed.setdefault(route.source, set()).add(route.listed)
-        connections[id] = {
-            "type": first.type.word if first.type else "",
-            "source": first.source,
-            "target": first.target,
-            "topics": _sorted(requesters),
-            "requesters": list(requesters_of(claims)),
-            # by topic, where they differ: its name at the target, and the ids that demands list it
-            # under
-            "targets": {r.source: r.target for r in routes if r.source != r.target},
-            "listed": _sorted(dict(sorted(listed.items()))),
-        }
+    releases = (plan(world, key) for key in all_keys(world))
+    services = {
+        release.name: service_entry(active, release)
+        for release in releases
+        if isinstance(release, ServiceRelease)
+    }
+    connections = {
+        id: connection_entry(claims)
+        for id in world.ledger.subjects(SubjectKind.CONNECTION)
+        if (claims := active.ledger.connection_claims(id))
+    }
     suspended = [
         {
             "kind": claim.subject.kind.value[:-1],
@@ -107,6 +70,54 @@ def bookkeeping(world: World) -> Json:
         # of those that declare a capacity, what services request of each resource, and the capacity
         "nodes": _nodes(world),
         "waiting": waiting,  # in the order of the tries to book
+    }
+
+
+def service_entry(active: World, release: ServiceRelease) -> Json:
+    inputs = {
+        role: {topic.topic: set[str]() for topic in topics}
+        for role, topics in release.inputs.items()
+    }
+    for claim in claims_of(release, active.ledger):
+        for role, topic in demanded_inputs(active, release, claim.application):
+            if topic in inputs[role]:  # a claim that a person wrote may name another topic
+                inputs[role][topic].update(claim.requesters)
+    return {
+        "applications": list(release.applications),
+        "service": release.key.service,
+        "node": release.node.id,
+        "source": release.key.source,
+        "source_topic": release.key.topic,
+        "version": release.chart.version,
+        "application_version": release.version.name or None,  # in registry/versions.yaml
+        "versions_asked": versions_asked(release, active.ledger),
+        "parameters": dict(release.parameters),
+        "inputs": {role: _sorted(topics) for role, topics in inputs.items()},
+        "requesters": list(release.requesters),
+    }
+
+
+def connection_entry(claims: Sequence[Claim]) -> Json:
+    # of claims that are not suspended, at least one
+    first = claims[0].connection
+    routes = connection_topics(claims)
+    requesters = {route.source: set[str]() for route in routes}
+    listed: dict[str, set[str]] = {}
+    for claim in claims:
+        for route in claim.connection.topics:
+            requesters[route.source].update(claim.requesters)
+            if route.listed:
+                listed.setdefault(route.source, set()).add(route.listed)
+    return {
+        "type": first.type.word if first.type else "",
+        "source": first.source,
+        "target": first.target,
+        "topics": _sorted(requesters),
+        "requesters": list(requesters_of(claims)),
+        # by topic, where they differ: its name at the target, and the ids that demands list it
+        # under
+        "targets": {r.source: r.target for r in routes if r.source != r.target},
+        "listed": _sorted(dict(sorted(listed.items()))),
     }
 
 

@@ -11,8 +11,24 @@ from demandops.base.errors import DemandOpsError
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.runtime import REAL
 from demandops.cluster import rollouts
-from demandops.cluster.health import Health, Target
-from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
+from demandops.cluster.health import (
+    ClusterDomain,
+    Health,
+    History,
+    ObjectSelector,
+    Target,
+    health_reader,
+)
+from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.release_status import (
+    ChangedPaths,
+    OldBootstrap,
+    Orphan,
+    ReleaseStatus,
+    old_bootstraps,
+    orphans,
+    statuses,
+)
 from demandops.decide.override_report import Entry, override_report, override_state
 from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
@@ -110,8 +126,10 @@ class Source:
     statuses: Mapping[str, ReleaseStatus] = field(default_factory=dict)
     watched: frozenset[str] = frozenset()  # clusters
     proposals: tuple[PendingProposal, ...] = ()
+    proposal_links: Mapping[str, str | None] = field(default_factory=dict)  # at a forge
     unread: str = ""  # why a newer state cannot be read or shown
     push_denied: str = ""  # why the node that shows the page cannot publish demands
+    unreadable: Mapping[str, str] = field(default_factory=dict)  # why, by the cluster's name
     old_bootstraps: tuple[OldBootstrap, ...] = ()
     orphans: tuple[Orphan, ...] = ()
     # What follows from the commit alone. Sources of one commit share it.
@@ -284,6 +302,40 @@ class Source:
             changes = self.reader().log(self.commit, path) if path else iter(())
             self._last_changes[path] = next(changes, None)
         return self._last_changes[path]
+
+    def with_reports(
+        self, caches: Mapping[str, ObjectCache], history: History, changed: ChangedPaths
+    ) -> Source:
+        """Add what clusters report, as read into their caches."""
+        targets, domains = [target for _, target in self.targets], self.domains
+        reported = statuses(targets, self.commit, caches, history, changed)
+        unread = {
+            name: cache.why_unknown(self.watched_objects.get(name, ()))
+            for name, cache in caches.items()
+        }
+        return replace(
+            self,
+            statuses={target.name: each for target, each in zip(targets, reported, strict=True)},
+            watched=frozenset(caches),
+            unreadable={name: reason for name, reason in sorted(unread.items()) if reason},
+            old_bootstraps=tuple(
+                old_bootstraps(domains, caches, self.reader().file_reader(self.commit))
+            ),
+            orphans=tuple(orphans(domains, targets, self.commit, caches, history)),
+        )
+
+    @_Derived
+    def domains(self) -> list[ClusterDomain]:
+        return rollouts.domains_of_state(self.state)
+
+    @_Derived
+    def watched_objects(self) -> dict[str, list[ObjectSelector]]:
+        """The objects that tell the health of the releases, by cluster."""
+        wanted: dict[str, dict[ObjectSelector, None]] = {}
+        for domain in dict.fromkeys((*(t.domain for _, t in self.targets), *self.domains)):
+            watched = health_reader(domain).objects_to_watch(domain)
+            wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
+        return {cluster: [*selectors] for cluster, selectors in wanted.items()}
 
     def status(self, release: str) -> ReleaseStatus:
         return self.statuses.get(release, _UNKNOWN)

@@ -37,7 +37,7 @@ from demandops.repo.load import ledger_files
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
 from demandops.views import release_causes
-from demandops.views.demand_lists import nodes_of
+from demandops.views.kinds import nodes_of
 from demandops.views.release_causes import by_booking
 from demandops.views.source import Source, since_of, word_of
 from demandops.views.vocabulary import (
@@ -459,7 +459,7 @@ def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | Non
         by_name = {release.name: release for release in releases}
         data["releases"] = [
             release_data(release)
-            | {"health": word_of(source.status(name)) if source.statuses else None}
+            | ({"health": word_of(source.status(name))} if source.statuses else {})
             for name, release in sorted(by_name.items())
         ]
     return data

@@ -14,8 +14,9 @@ from typing import Any
 
 from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
+from demandops.views.kinds import rows_of
+from demandops.views.rows import Filter, Row, exactly
 from demandops.views.source import RANKS, WORDS, Source, word_of
-from demandops.web.lists import Filter, Row, exactly, rows_of
 
 # A drawing for wide screens and one for phones, of which the style sheet shows one: its width, the
 # widths of its large and of its small cards, the least gap between them, and above how many nodes
@@ -140,19 +141,19 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     lit, lit_releases = set[str](), set[str]()  # a node is lit with a service or connection of it
     links, peers = list[Link](), defaultdict[str, set[str]](set)
     for row in rows_of(source, "connections"):
-        if known.keys() >= {*(ends := tuple(row.hidden["node"]))}:
+        if known.keys() >= {*(ends := tuple(row.item["nodes"]))}:
             is_lit = bool(wanted) and wanted.matches(row)
-            word, topics = row.cells["health"].parts[0].text, len(row.cells["topic"].parts)
-            links.append(Link(ends, row.cells["connection"].parts[0].text, topics, word, is_lit))
+            word, topics = row.item["health"] or "unknown", len(row.item["topics"])
+            links.append(Link(ends, row.item["name"], topics, word, is_lit))
             peers[ends[0]].add(ends[1])
             peers[ends[1]].add(ends[0])
             if is_lit:
                 lit.update(ends)
-                lit_releases.update(part.text for part in row.cells["release"].parts)
+                lit_releases.update(row.item["releases"])
     for row in rows_of(source, "services") if wanted else ():
         if wanted.matches(row):
-            lit.update(part.text for part in row.cells["node"].parts)
-            lit_releases.update(part.text for part in row.cells["release"].parts)
+            lit.add(row.item["node"])
+            lit_releases.add(row.item["name"])
     marks: dict[str, list[Mark]] = {id: [] for id in known}
     for release, _ in source.targets:
         if release.node.id not in marks:
@@ -169,7 +170,7 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
         texts = {"node": [node.id], "type": [node.type], "cluster": [node.cluster]}
         texts["peer"] = sorted(peers[node.id]) or ["none"]
         texts["cell"] = [_cell(spots[node.id])] if node.id in spots else []
-        if wanted.matches(Row({}, texts)):
+        if wanted.matches(Row(texts)):
             chosen.add(node.id)
     lit = (lit | chosen) & known.keys()
 

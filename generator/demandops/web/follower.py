@@ -12,11 +12,8 @@ from itertools import islice
 from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
-from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health import ClusterDomain, health_reader
 from demandops.cluster.object_cache import object_caches
-from demandops.cluster.release_status import old_bootstraps, orphans, statuses
 from demandops.repo.git.repository import reading
 from demandops.repo.load.snapshot import Progress
 from demandops.repo.reader import Reader
@@ -36,7 +33,6 @@ class ClusterWatch:
     ) -> None:
         self._caches = object_caches(clusters, on_change, REAL)
         self.clusters = frozenset(self._caches)
-        self._domains = set[ClusterDomain]()
         self._seen: dict[str, str] = {}  # the word for the health of each release
         self._changes = deque[HealthChange](maxlen=_KEPT)
 
@@ -46,31 +42,21 @@ class ClusterWatch:
         return tuple(self._changes.copy())
 
     def with_reports(self, source: Source, reader: Reader) -> Source:
-        caches, repository = self._caches, reader.repository
-        targets = [target for _, target in source.targets]
-        domains = rollouts.domains_of_state(source.state)
-        for domain in dict.fromkeys((*(target.domain for target in targets), *domains)):
-            if domain.cluster in caches and domain not in self._domains:
-                self._domains.add(domain)
-                caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
-        commit = source.commit
+        for cluster, objects in source.watched_objects.items():
+            if cluster in self._caches:
+                self._caches[cluster].watch(objects)
         # Health is judged by the file that the cluster has applied. Judged by the newest commit,
         # everything would be `waiting` for seconds after each commit.
-        reported = statuses(targets, commit, caches, repository, repository.changed_paths)
-        status_of = {target.name: status for target, status in zip(targets, reported, strict=True)}
-        for name, status in status_of.items():
+        repository = reader.repository
+        source = source.with_reports(self._caches, repository, repository.changed_paths)
+        for name, status in source.statuses.items():
             before, after = self._seen.get(name, ""), word_of(status)
             self._seen[name] = after
             if before and before != after:  # the first health that a cluster reports is no change
                 reason = status.health.reason
                 self._changes.append(HealthChange(REAL.now(), name, before, after, reason))
-        self._seen = {name: self._seen[name] for name in status_of}
-        return replace(
-            source,
-            statuses=status_of,
-            old_bootstraps=tuple(old_bootstraps(domains, caches, reader.file_reader(commit))),
-            orphans=tuple(orphans(domains, targets, commit, caches, repository)),
-        )
+        self._seen = {name: self._seen[name] for name in source.statuses}
+        return source
 
     def close(self) -> None:
         for cache in self._caches.values():

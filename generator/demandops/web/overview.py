@@ -12,8 +12,10 @@ from demandops.cluster.release_status import ReleaseStatus
 from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.release import ServiceRelease
 from demandops.views.causes import Cause
-from demandops.views.source import Source, worst_word
-from demandops.web.lists import Filter, Part, Row, exactly, rows_of
+from demandops.views.kinds import rows_of
+from demandops.views.rows import TONES, Filter, Row, exactly
+from demandops.views.source import RANKS, Source, worst_word
+from demandops.web.lists import Part
 from demandops.web.time_line import BOOKED, RELEASED, Event
 
 
@@ -33,23 +35,22 @@ def figures(source: Source, wanted: Filter, events: Iterable[Event], now: dateti
         return [row for row in rows_of(source, name) if wanted.matches(row)]
 
     def of_list(rows: list[Row], what: str, view: str) -> Figure:
-        cells = [row.cells["health"] for row in rows]
-        counts = Counter((cell.rank, cell.parts[0].text, cell.tone) for cell in cells)
+        counts = Counter(row.item["health"] or "unknown" for row in rows)
         words = [
-            (Part(f"{count} {word}", view, {"q": exactly("health", word)}), tone)
-            for (_, word, tone), count in sorted(counts.items())
+            (Part(f"{count} {word}", view, {"q": exactly("health", word)}), TONES[word])
+            for word, count in sorted(counts.items(), key=lambda pair: RANKS[pair[0]])
         ]
         return Figure(len(rows), Part(_counted(len(rows), what), view), words)
 
     services, connections, demands = map(matching, ("services", "connections", "demands"))
-    requesters = {part.text for row in demands for part in row.cells["requester"].parts}
-    nodes = {id for row in demands for id in row.hidden["node"]} & source.config.nodes.keys()
-    waiting = [row for row in demands if row.cells["health"].parts[0].text == "waits for room"]
+    requesters = {who for row in demands for who in row.item["requesters"]}
+    nodes = {id for row in demands for id in row.item["nodes"]} & source.config.nodes.keys()
+    waiting = [row for row in demands if row.item["state"] == "waiting"]
     waits = [
         (count, (Part(f"{count} for {what}", view, params), "busy"))
         for count, what, view, params in (
-            (len(source.proposals), "approval", "overrides", {}),
-            (len(waiting), "room", "demands", {"q": exactly("health", "waits for room")}),
+            (len(source.proposals), "approval", "proposals", {}),
+            (len(waiting), "room", "demands", {"q": exactly("state", "waiting")}),
         )
         if count
     ]
@@ -66,12 +67,12 @@ def figures(source: Source, wanted: Filter, events: Iterable[Event], now: dateti
         of_list(demands, "demand", "demands"),
         Figure(
             len(requesters),
-            Part(_counted(len(requesters), "requester"), "demands", {"sort": "requester"}),
+            Part(_counted(len(requesters), "requester"), "requesters"),
         ),
         Figure(len(nodes), Part(f"of {len(source.config.nodes)} nodes used", "map")),
         Figure(
             sum(count for count, _ in waits),
-            Part("waiting", "overrides"),
+            Part("waiting", "proposals"),
             [part for _, part in waits],
         ),
         Figure(
@@ -103,7 +104,7 @@ def link_of(cause: Cause) -> Part:
         "releases": ("services", {"q": query}),
         "demand": ("demands", {"q": exactly("demand", cause.what)}),
         "override": ("overrides", {}),
-        "proposal": ("overrides", {}),
+        "proposal": ("proposals", {}),
         "": ("", {}),
     }[cause.names]
     return Part(cause.what, view, params)
@@ -132,7 +133,7 @@ def applications(source: Source, causes: Iterable[Cause], wanted: Filter) -> lis
     shown = []
     for application, claims in sorted(claims_of.items()):
         texts = {"requester": requesters_of(claims), "demand": [claim.demand for claim in claims]}
-        if wanted.matches(Row({}, texts | {"application": [application]})):
+        if wanted.matches(Row(texts | {"application": [application]})):
             word, first = worst_word(statuses[application]), first_causes.get(application)
             # what runs well may still be denied or invalid; then the cause says more
             if first and word in ("healthy", "unknown"):

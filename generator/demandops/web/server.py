@@ -33,13 +33,14 @@ from demandops.base.quoting import escaped, lines
 from demandops.model.config.base_model import parse_time, relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
-from demandops.views.causes import KINDS
-from demandops.views.causes import causes as causes_of
+from demandops.views import causes as cause_list
+from demandops.views.kinds import KINDS, rows_of
+from demandops.views.rows import Filter, Row, exactly, page_of, sorted_rows
 from demandops.views.source import WORDS, Source
 from demandops.views.vocabulary import decision_text
-from demandops.web import fleet_map, lists, overview, time_line
+from demandops.web import fleet_map, overview, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
-from demandops.web.lists import LISTS, Filter, Part, Row, rows_of
+from demandops.web.lists import LISTS, PAGE, Part, cells_of
 from demandops.web.thing import thing
 from demandops.web.time_line import Event
 
@@ -51,9 +52,8 @@ _KEPT = ("at", "q")
 NAVIGATION = (
     ("", "Overview"),
     ("map", "Map"),
-    *((name, kind.title) for name, kind in LISTS.items()),
+    *((name, KINDS[name].title) for name in LISTS),
     ("timeline", "Time line"),
-    ("overrides", "Overrides"),
 )
 
 
@@ -100,7 +100,7 @@ class ViewRequest:
 
 def _overview(asked: ViewRequest) -> tuple[str, Data]:
     source, wanted = asked.source, asked.filter
-    causes = [cause for cause in causes_of(source) if wanted.matches(Row({}, cause.labels))]
+    causes = [cause for cause in cause_list.causes(source) if wanted.matches(Row(cause.labels))]
     moment = source.now if source.is_newest else source.entry.time
     events = [event for event in asked.events() if event.time <= moment]
     return "overview.html.j2", {
@@ -108,23 +108,27 @@ def _overview(asked: ViewRequest) -> tuple[str, Data]:
         "causes": [(cause, overview.link_of(cause)) for cause in causes[:_MOST_CAUSES]],
         "total": len(causes),
         "applications": overview.applications(source, causes, wanted),
-        "tones": {**WORDS, **KINDS},
+        "tones": {**WORDS, **cause_list.KINDS},
         "events": islice(overview.newest(events), _NEWEST),
         "overrides": source.overrides,
     }
 
 
 def _list(asked: ViewRequest) -> tuple[str, Data]:
-    kind, sort = LISTS[asked.path], asked.get("sort")  # `-` before a key is the reverse order
+    kind, now, sort = KINDS[asked.path], asked.source.now, asked.get("sort")
     rows = rows_of(asked.source, asked.path)
     matching = [row for row in rows if asked.filter.matches(row)]
-    if (key := sort.removeprefix("-")) not in kind.columns:
-        sort = key = next(iter(kind.columns))
-    matching.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
-    shown, page, pages = lists.page_of(matching, asked.page(), lists.PAGE)
+    columns = {column.key: column for column in kind.columns if not column.only_wide}
+    if (key := sort.removeprefix("-")) in columns:  # `-` before a key is the reverse order
+        matching = sorted_rows(matching, columns[key], now, down=sort.startswith("-"))
+    shown, page, pages = page_of(matching, asked.page(), PAGE)
+    cells = [cells_of(kind, row, now) for row in shown]
+    # of the columns that only some rows fill, those that a shown row fills
+    used = {cell.column.key for each in cells for cell in each if cell.parts}
     return "list.html.j2", {
         "kind": kind,
-        "rows": shown,
+        "columns": [c for key, c in columns.items() if key in used or not shown],
+        "rows": cells,
         "total": len(rows),
         "matching": len(matching),
         "sort": sort,
@@ -142,7 +146,7 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     changed: list[str] = []
     if asked.get("at"):
         changed = asked.follower.reader().files_changed_by(now.commit)
-    shown, page, pages = lists.page_of(events, asked.page(), size=50)
+    shown, page, pages = page_of(events, asked.page(), size=50)
     return "timeline.html.j2", {
         "strip": time_line.strip(events, now.now, span, chosen),
         "span": span,
@@ -156,21 +160,6 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
         "changed": changed,
         "is_cut": len(asked.follower.history) >= MOST_COMMITS,
     }
-
-
-def _overrides(asked: ViewRequest) -> tuple[str, Data]:
-    entries = []
-    for entry in asked.source.overrides:
-        texts = {
-            "owner": [entry.override.owner],
-            "reason": [entry.override.reason],
-            "release": [release.name for release in entry.releases],
-            "demand": [claim.demand for claim in entry.claims],
-            "requester": [who for claim in entry.claims for who in claim.requesters],
-        }
-        if asked.filter.matches(Row({"override": lists.cell(entry.override.name)}, texts)):
-            entries.append(entry)
-    return "overrides.html.j2", {"entries": entries}
 
 
 def _thing(asked: ViewRequest) -> tuple[str, Data]:
@@ -187,12 +176,11 @@ VIEWS: Mapping[str, View] = {
         "map.html.j2",
         {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
     ),
-    **{f"/{name}": _list for name in LISTS},
+    **{f"/{name}": _list for name in (*LISTS, "services")},
     "/thing": _thing,
     "/demand": _thing,
     "/release": _thing,
     "/timeline": _timeline,
-    "/overrides": _overrides,
 }
 
 
@@ -310,7 +298,7 @@ class Site:
                     "here": asked,
                     "now": asked.source.now,
                     "source": asked.source,
-                    "exactly": lists.exactly,
+                    "exactly": exactly,
                     "program": __version__,
                     "has_docs": self._has_docs,
                     "version": version,

@@ -22,8 +22,11 @@ from demandops.views.why import (
 
 _TONES = WORDS | {
     **dict.fromkeys(("runs", "held", "used", "in force", "approved", "exists"), "good"),
+    "kept": "none",
     **dict.fromkeys(("denied", "suspended", "rejected"), "bad"),
-    **dict.fromkeys(("waiting", "proposed", "partly suspended", "not rendered yet"), "busy"),
+    **dict.fromkeys(
+        ("waiting", "proposed", "overdue", "partly suspended", "not rendered yet"), "busy"
+    ),
 }
 _MOST_COMMITS = 20
 

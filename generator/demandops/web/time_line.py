@@ -10,8 +10,8 @@ from typing import Any
 
 from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.repo.history.commit_message import PROPOSAL
+from demandops.views.rows import Row
 from demandops.views.source import WORDS, Commit, HealthChange
-from demandops.web.lists import Row, cell
 
 # The title of each lane of the time line, from top to bottom, by the lane's name.
 LANES = {
@@ -54,8 +54,14 @@ class Event:
 
     def row(self) -> Row:
         return Row(
-            {"lane": cell(self.lane), "word": cell(self.word), "summary": cell(self.summary)},
-            {"who": [self.who], "commit": [self.commit], "release": [self.release]},
+            {
+                "lane": [self.lane],
+                "word": [self.word],
+                "summary": [self.summary],
+                "who": [self.who],
+                "commit": [self.commit],
+                "release": [self.release],
+            }
         )
 
 

@@ -270,7 +270,7 @@ def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
 
 def show(replay: Replay, output: str) -> None:
     columns = [Column(name) for name in ("Second", "Change", "Rule", "Entities")]
-    columns += [Column("Why", rank=2, wraps=True), Column("Demand", rank=1)]
+    columns += [Column("Why", rank=2), Column("Demand", rank=1)]
     rows = [
         (
             f"{event.at - replay.span[0]:.1f}",

@@ -14,9 +14,10 @@ from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.views.causes import Cause
 from demandops.views.causes import causes as causes_of
+from demandops.views.rows import Filter, Row
 from demandops.views.source import Source
 from demandops.web.follower import Follower
-from demandops.web.lists import Filter, Row
+from demandops.web.lists import LISTS
 from demandops.web.server import Site
 from starlette.testclient import TestClient
 
@@ -24,8 +25,7 @@ from tests.kit import goals
 from tests.kit.generator import book, running, wait_until
 from tests.kit.html import Page
 
-VIEWS = ("/", "/map", "/demands", "/services", "/connections", "/leases", "/timeline",
-         "/overrides")  # fmt: skip
+VIEWS = ("/", "/map", "/services", "/timeline", *(f"/{name}" for name in LISTS))
 DENY = """apiVersion: demandops/v1
 kind: Override
 reason: The road is closed
@@ -103,4 +103,4 @@ def look(shown: Shown) -> Look:
 
 
 def causes(source: Source, text: str = "") -> list[Cause]:
-    return [cause for cause in causes_of(source) if Filter(text).matches(Row({}, cause.labels))]
+    return [cause for cause in causes_of(source) if Filter(text).matches(Row(cause.labels))]

@@ -15,9 +15,11 @@ import pytest
 import yaml
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
+from demandops.views.kinds import rows_of
+from demandops.views.rows import Filter
 from demandops.web import fleet_map, server
 from demandops.web.follower import Follower
-from demandops.web.lists import LISTS, Filter, rows_of
+from demandops.web.lists import LISTS
 from demandops.web.server import Site
 from starlette.testclient import TestClient
 
@@ -90,7 +92,6 @@ def test_an_invalid_file_names_who_wrote_it(
     assert cause.kind == "invalid"
     assert cause.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
     assert cause.command.startswith("git show ")
-    assert "registry/images.yaml" in look("/overrides").text
     assert "stays in effect" in page.text and "git revert --no-edit -m 1 " in page.text
 
 
@@ -118,7 +119,7 @@ def test_a_proposal_names_its_commit_and_how_to_approve_just_that(
     commit = git(state.path, "rev-parse", branch)
     approve = f"demandops approve {branch} --commit {commit}"
     assert approve in look("/").text
-    shown = look("/overrides").text
+    shown = look("/proposals").text
     assert commit in shown and approve in shown
     assert approve.replace("approve", "reject") in shown
 
@@ -130,7 +131,7 @@ def _approved(generator: Generator) -> bool:
 def test_a_lease_is_listed_with_its_end(booked: Generator, look: Look) -> None:
     book(booked, goals.put("short", "vehicle02", applications=[], connections=[LINK], lease="10m"))
     (row,) = look("/leases").texts("tr")[1:]
-    assert re.match(r"in [0-9m]+s? vehicle02/cloud connection short vehicle02 10m", row)
+    assert re.match(r"short in [0-9m]+s? vehicle02 10m vehicle02/cloud", row)
 
 
 def test_a_release_that_stopped_is_still_explained(booked: Generator, look: Look) -> None:

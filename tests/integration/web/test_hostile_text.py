@@ -64,7 +64,7 @@ def test_a_branch_is_no_command_and_hides_nothing(
     wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
     shown = branch.replace(HIDDEN, "\\u202e")
     wanted = ["demandops", "approve", shown, "--commit", commit]
-    page = look("/overrides")
+    page = look("/proposals")
     (approve,) = [text for text in page.texts("code") if " approve " in text]
     assert shlex.split(approve) == wanted
     (approve,) = [text for text in look("/").texts("code") if " approve " in text]

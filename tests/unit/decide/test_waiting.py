@@ -11,7 +11,6 @@ from demandops.decide.booking import Restoration
 from demandops.model.demand.demand import Decommission
 from demandops.model.ledger import records
 from demandops.model.ledger.records import in_turn
-from demandops.views.demand_lists import demands
 
 from tests.kit.memory import MemoryRepo
 from tests.unit.decide.test_capacity import book_waiting, recorders
@@ -49,12 +48,6 @@ def full_repo() -> MemoryRepo:
         taken = repo.send(put(name) | {"requesters": [who]})
         assert taken.outcome == "waiting" and taken.lease_s is None
     return repo
-
-
-def test_the_list_of_demands_has_those_that_wait() -> None:
-    listed = [(one.name, one.state, len(one.applications)) for one in demands(full_repo().state)]
-    held = [(f"full{number}", "held", 1) for number in range(3)]
-    assert listed == [*held, ("a", "waiting", 0), ("b", "waiting", 0)]
 
 
 def test_a_decommissioned_requester_waits_no_longer() -> None:

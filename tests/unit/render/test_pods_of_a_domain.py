@@ -7,7 +7,6 @@ selectors from CEL to Python and evaluate the result.
 from __future__ import annotations
 
 import re
-import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from random import Random
@@ -26,7 +25,9 @@ from tests.kit.memory import MemoryRepo
 
 DOMAINS, NODES = "policy/access-domains.yaml", "inventory/nodes.yaml"
 BOOTSTRAP = "bootstrap/c-its.yaml"
-PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
+ROOT = Path(__file__).parents[3]
+PAGE = (ROOT / "docs" / "policy.md").read_text()
+EXAMPLE = ROOT / "examples" / "policy" / "sensors-apart.yaml"
 HEAD = "apiVersion: demandops/v1\nkind: {}\n"
 POLICY = f"""{HEAD.format("AccessDomains")}domains:
   - {{name: fleet, namespace: ns-fleet, nodes: ["vehicle*", "car.[?]", own*]}}
@@ -144,9 +145,7 @@ def test_each_level_has_its_label_and_rules(level: str, gitops: str) -> None:
 
 
 def test_the_example_of_the_documentation() -> None:
-    examples = re.findall(r"\n\n    domains:\n(?:      .*\n)+", PAGE)
-    (example,) = (found for found in examples if "podSecurity" in found)
-    policy = f"{HEAD.format('AccessDomains')}{textwrap.dedent(example).lstrip()}"
+    policy = EXAMPLE.read_text()
     text = rendered_files(MemoryRepo({DOMAINS: policy}).state)[BOOTSTRAP]
     rules = {
         item["metadata"]["name"]: item["spec"]["validations"]

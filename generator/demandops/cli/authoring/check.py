@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from demandops.base.quoting import lines, one_line
-from demandops.cli.json_output import Json, output_formats, print_json
+from demandops.cli.json_output import output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.queries.diff import entry_lines, release_lines
 from demandops.decide.bookkeeping import EntryChange
@@ -20,6 +20,7 @@ from demandops.repo.merge_check.merge_check import CheckResult
 from demandops.repo.merge_check.rendered_charts import MISSING, NO_HELM, RenderedCharts
 from demandops.serve.approvals.proposal import backticks
 from demandops.templating.evaluator import processor_time
+from demandops.views.vocabulary import Json
 
 # ---- the result as a comment on a pull request ----
 #

@@ -14,13 +14,13 @@ from demandops.base.settings import GENERATED_ROOTS
 from demandops.base.strict_yaml import faults_in
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import Options, changing, propose_option, writable
-from demandops.cli.json_output import Json
 from demandops.cli.target import names_of
 from demandops.decide.booking import Drain
 from demandops.decide.placement import relocation
 from demandops.decide.state import State
 from demandops.model.config.config import NODES_FILE
 from demandops.model.ledger.claim import LEDGER_ROOT
+from demandops.views.vocabulary import Json
 
 # ---- ``demandops drain`` and ``undrain``: the field `drained` of a node in the inventory ----
 

@@ -22,7 +22,7 @@ from demandops.cli.changes.person_change import (
     consequence,
     warned_if_unnamed,
 )
-from demandops.cli.json_output import Json, claim_data, show
+from demandops.cli.json_output import show
 from demandops.cli.output import busy, done, errors, fitted, progress, terminal_width
 from demandops.cli.target import names_of
 from demandops.decide.decision import decide
@@ -35,6 +35,7 @@ from demandops.repo import reader
 from demandops.repo.history import commit_log
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
+from demandops.views.vocabulary import Json, claim_data
 
 # ---- a booking: decide, show what follows, ask, and book ----
 

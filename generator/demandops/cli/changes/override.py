@@ -17,7 +17,6 @@ from demandops.base.strict_yaml import read_input
 from demandops.cli import target
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import Options, changing, propose_option, writable
-from demandops.cli.json_output import Json, override_data
 from demandops.cli.output import read_by
 from demandops.cli.target import names_of
 from demandops.decide.state import State
@@ -26,6 +25,7 @@ from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.config.policy import matches
 from demandops.repo.reader import Reader
+from demandops.views.vocabulary import Json, override_data
 
 # ---- what the commands share: their options and selection ----
 

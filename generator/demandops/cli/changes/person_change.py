@@ -23,7 +23,6 @@ from demandops.base.quoting import harmless, one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import json_output, target
-from demandops.cli.json_output import Json
 from demandops.cli.output import done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.diff import release_lines
 from demandops.decide.changeset import (
@@ -45,6 +44,8 @@ from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails
 from demandops.serve.approvals.proposal import merge_request
+from demandops.views import vocabulary
+from demandops.views.vocabulary import Json
 
 # ---- the options of all these commands ----
 
@@ -215,7 +216,7 @@ def commit(
         "link": None,
         "files": dict(files),
         "releases": [asdict(change) for change in changes],
-        "claims": [json_output.claim_data(claim) for claim in claims],
+        "claims": [vocabulary.claim_data(claim) for claim in claims],
         **of_command,
     }
     if options.dry_run:

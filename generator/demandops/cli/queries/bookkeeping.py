@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import click
 
-from demandops.cli.json_output import output_option, show, time_text
+from demandops.cli.json_output import output_formats, show
 from demandops.cli.output import at_option
 from demandops.cli.queries.diff import loaded
-from demandops.cli.queries.get import KINDS
-from demandops.cli.table import Table, column, joined, table_of
+from demandops.cli.table import Table, column, list_table, table_of
 from demandops.cli.target import state_repo_option
 from demandops.decide.bookkeeping import as_data
 from demandops.decide.bookkeeping import bookkeeping as derive
 from demandops.repo import reader
+from demandops.views.kinds import KINDS, rows_of
+from demandops.views.source import Source
+from demandops.views.vocabulary import time_text
 
 
 @click.command()
 @state_repo_option
 @at_option
-@output_option
+@output_formats("text", "wide", "json")
 def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     """Show who requests which service and connection.
 
@@ -28,9 +32,8 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
       demandops bookkeeping --at 14:03 -o json
     """
     with reader.opened(state_repo) as repo:
-        snapshot = loaded(repo, at)
-    commit = str(snapshot.commit)
-    data = as_data(derive(snapshot.state), commit)
+        source = Source.read(repo, loaded(repo, at))
+    data = as_data(derive(source.state), source.commit)
     capacity = [
         {"node": node, "name": name, **amounts}
         for node, resources in data.get("nodes", {}).items()
@@ -38,9 +41,8 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     ]
     text: list[str | Table] = []
     for name in ("services", "connections"):
-        columns = (*KINDS[name].columns, *KINDS[name].wide)
-        entries = [{"name": id, **entry} for id, entry in data[name].items()]
-        text += [table_of(columns, entries, None, title=name.title()), ""]
+        table = list_table(KINDS[name], rows_of(source, name), source.now, wide=True)
+        text += [replace(table, title=name.title(), empty="(nothing)", whole=output == "wide"), ""]
     for title, columns, items in (
         ("Suspended", _SUSPENDED, data.get("suspended")),
         ("Capacity", _CAPACITY, capacity),
@@ -48,15 +50,15 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     ):
         if items:
             text += [table_of(columns, items, title=title), ""]
-    show(output, data, [*text, f"at {commit}"])
+    show(output, data, [*text, f"at {source.commit}"])
 
 
 _SUSPENDED = (
     column("Subject", lambda claim: "{kind} {id}".format(**claim)),
-    column("Demand", "demand", 3),
-    column("Requesters", joined("requesters"), 2, wraps=True),
-    column("By", "override", 1),
-    column("Reason", "reason", 4, wraps=True),
+    column("Demand", "demand", 2),
+    column("Requesters", "requesters", 1),
+    column("By", "override", 3),
+    column("Reason", "reason", 4),
 )
 _CAPACITY = (
     column("Node", "node"),
@@ -66,7 +68,7 @@ _CAPACITY = (
 )
 _WAITING = (
     column("Demand", "demand"),
-    column("Requesters", lambda demand: "\n".join(demand["requesters"]), 2, wraps=True),
+    column("Requesters", "requesters", 2),
     column("Since", lambda demand: time_text(demand["since"]), 1),
     column("Priority", lambda demand: str(demand["priority"]), 1),
 )

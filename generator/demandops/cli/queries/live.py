@@ -13,17 +13,18 @@ import click
 
 from demandops.base.errors import StateRepoError
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import commit_data
 from demandops.cli.output import errors, painted, progress, read_by
-from demandops.cli.queries.get import KINDS, Source
 from demandops.cli.queries.log import log_table
-from demandops.cli.queries.status import Status, releases_table
-from demandops.cli.table import Table
+from demandops.cli.queries.status import amiss, read_status
+from demandops.cli.table import Table, list_table
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
 from demandops.repo import reader
 from demandops.repo.reader import Reader
 from demandops.serve.agenda import parse_interval
+from demandops.views.kinds import HEALTH, KINDS, rows_of
+from demandops.views.rows import sorted_rows
+from demandops.views.vocabulary import commit_data
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 
@@ -75,24 +76,22 @@ def _screen(
     repo: Reader, clusters: Mapping[str, clusters_file.ClusterAccess], away: str
 ) -> list[str]:
     width, height = shutil.get_terminal_size()
-    now = REAL.now()
-    status = Status.of(repo, clusters)
-    source = Source(repo, repo.snapshot(), now)
-    demands = KINDS["demands"]
-    items = demands.items(source)
-    rows = [commit_data(entry) for entry in islice(repo.log(), 6)]
-    amiss = "; ".join(filter(None, (status.amiss(clusters), away)))
-    health = painted(f"not well: {amiss}", "red") if amiss else painted("all is well", "green")
-    if not clusters and not amiss:
+    source = read_status(repo, clusters)
+    now, releases = source.now, rows_of(source, "releases")
+    demands = rows_of(source, "demands")
+    wrong = "; ".join(filter(None, (amiss(source, clusters), away)))
+    health = painted(f"not well: {wrong}", "red") if wrong else painted("all is well", "green")
+    if not clusters and not wrong:
         health = "the health is unknown: give --clusters FILE"
-    head = f"{repo.repository.address} at {status.commit[:10]}, {now:%H:%M:%S} UTC"
-    counts = f"{len(status.rows)} releases, {len(items)} demands"
-    releases = sorted(status.rows, key=lambda row: (row["health"] == "healthy", row["name"]))
-    commits = log_table(rows, now)
+    head = f"{repo.repository.address} at {source.commit[:10]}, {now:%H:%M:%S} UTC"
+    counts = f"{len(releases)} releases, {len(demands)} demands"
+    releases = sorted_rows(releases, HEALTH, now)
+    commits = log_table([commit_data(entry) for entry in islice(repo.log(), 6)], now)
     last = _part("Latest commits", commits, width, height // 3)
     room = height - _OTHER_LINES - len(last)
-    first = _part("Releases", releases_table(releases), width, room * 2 // 3)
-    middle = _part("Demands", demands.table(items, now), width, room - len(first))
+    running = list_table(KINDS["releases"], releases, now)
+    first = _part("Releases", running, width, room * 2 // 3)
+    middle = _part("Demands", list_table(KINDS["demands"], demands, now), width, room - len(first))
     title = [painted(head, "bold"), f"{counts}; {health}"]
     return [*title, "", *first, "", *middle, "", *last][: height - 1]
 

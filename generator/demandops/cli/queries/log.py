@@ -11,15 +11,9 @@ import click
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import (
-    Json,
-    commit_data,
-    decision_text,
-    output_formats,
-    show,
-    time_text,
-)
+from demandops.cli.json_output import output_formats, show
 from demandops.cli.output import busy
+from demandops.cli.queries.diff import resolved
 from demandops.cli.table import Table, column, table_of
 from demandops.cli.target import name_options, state_repo_option
 from demandops.model.config.base_model import parse_time, relative
@@ -27,6 +21,7 @@ from demandops.repo import reader
 from demandops.repo.history import revisions
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.reader import Reader
+from demandops.views.vocabulary import Json, commit_data, decision_text, time_text
 
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
@@ -112,6 +107,8 @@ def log(
       demandops log main~20..main -o wide
     """
     with reader.opened(state_repo) as repo:
+        for side in filter(None, (commit_range or "").split("..")):
+            resolved(repo, side)
         release, path = given.pop("release"), None
         if release is not None:
             tip = repo.commit((commit_range or "").rpartition("..")[2])
@@ -177,7 +174,6 @@ _COLUMNS = (
             row["summary"],
             *([decision_text(row["decision"])] if row["decision"] else []),
         ],
-        wraps=True,
     ),
     column(
         "Requesters",
@@ -188,7 +184,6 @@ _COLUMNS = (
             else ", ".join(row["requesters"]) or row["author"]
         ),
         1,
-        wraps=True,
     ),
 )
 _WIDE = (

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import click
 
 from demandops.cli import json_output
-from demandops.cli.output import at_option, busy
+from demandops.cli.output import at_option, busy, fitted, terminal_width
 from demandops.cli.queries.diff import loaded
 from demandops.cli.target import names_of, state_repo_option
 from demandops.model.config.base_model import duration_text
@@ -213,4 +213,4 @@ def why(
         source = Source.read(repo, snapshot, is_newest=not at, proposals=proposals)
         with busy("looking through the commits"):
             answer = explain(source, find(source, name, kind), most)
-    json_output.show(output, answer, lines_of(answer))
+    json_output.show(output, answer, (fitted(line, terminal_width()) for line in lines_of(answer)))

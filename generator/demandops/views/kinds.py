@@ -1,0 +1,925 @@
+"""The lists that people see, each once: the items, as docs/json.md has them, and the columns."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from itertools import islice
+from typing import Any
+
+from demandops.base.naming import SubjectKind
+from demandops.cluster.health import Health
+from demandops.cluster.release_status import ReleaseStatus
+from demandops.decide.bookkeeping import carried_topics, connection_entry, service_entry
+from demandops.decide.override_report import Entry
+from demandops.decide.planning.overrides import suspended_by
+from demandops.model.config.base_model import duration_text, parse_time, relative
+from demandops.model.config.config import DOMAINS_FILE
+from demandops.model.ledger.claim import Claim, requesters_of
+from demandops.model.ledger.records import WaitingDemand
+from demandops.model.release import Release, ServiceRelease
+from demandops.views import vocabulary
+from demandops.views.rows import Column, Row, labels_of
+from demandops.views.source import Source, since_of, word_of, worst_word
+from demandops.views.vocabulary import Json, claim_data, lease_data, subject_text, time_data
+
+# How many of the newest commits are searched for events and for what is gone.
+MOST_COMMITS = 2_000
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A list: its rows are made of ``entries`` and kept while the values of an entry stay equal."""
+
+    name: str
+    about: str
+    columns: Sequence[Column]
+    # Yields the id of each entry and the values of which ``item`` makes its item.
+    entries: Callable[[Source], Iterator[tuple[str, tuple[Any, ...]]]]
+    item: Callable[..., Json] = lambda source, item: item
+    # Further texts by which an item is found, by label.
+    labels: Callable[[Json], dict[str, Iterable[str]]] = lambda item: {}
+    trailer: str = ""  # of commits: names what their commit changes, so that its past can be listed
+
+    @property
+    def word(self) -> str:
+        return self.name[:-1]
+
+    @property
+    def title(self) -> str:
+        return self.name.capitalize()
+
+    def row(self, item: Json) -> Row:
+        more = self.labels(item)
+        more[self.word] = (*more.get(self.word, ()), item["name"])
+        return Row(labels_of(item, **more), item)
+
+
+def rows_of(source: Source, name: str) -> list[Row]:
+    kind, moment = KINDS[name], source.now.replace(second=0, microsecond=0)
+    made_for, made = source.rows.get(name, (None, {}))
+    # the follower makes a new mapping of statuses whenever it looks; the minute decides which
+    # leases are over
+    wanted = source.statuses, source.proposals, moment
+    if made_for != wanted:
+        rows: dict[str, tuple[tuple[Any, ...], Row]] = {}
+        for id, values in kind.entries(source):
+            before = made.get(id)
+            if before is None or before[0] != values:
+                before = values, kind.row(kind.item(source, *values))
+            rows[id] = before
+        source.rows[name], made = (wanted, rows), rows
+    return [row for _, row in made.values()]
+
+
+def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
+    """Return what is gone, the newest first, and the commit where the search ended, if it did.
+
+    The newest commit that names a thing which is not there now is the one that ended it.
+    """
+    kind, past = KINDS[name], list[Row]()
+    seen = {row.item["name"] for row in rows_of(source, name)}
+    for number, entry in enumerate(source.reader().log(source.commit)):
+        if number == MOST_COMMITS:
+            return past, entry.commit
+        trailers = entry.trailers
+        for gone in trailers.get(kind.trailer, ()):
+            if gone in seen:
+                continue
+            seen.add(gone)
+            item = {column.key: None for column in kind.columns} | {
+                "name": gone,
+                "state": "gone",
+                "requesters": trailers.get("Requester", []),
+                "applications": trailers.get("Application", []),
+                "connections": trailers.get("Connection", []),
+                "ended": {
+                    "time": time_data(entry.time),
+                    "by": entry.author,
+                    "operation": entry.first("Operation") or None,
+                    "commit": entry.commit,
+                },
+            }
+            past.append(kind.row(item))
+    return past, ""
+
+
+# ---- columns that several lists have ----
+
+REQUESTERS = Column("requesters", "Requesters", 2, links="requester")
+HEALTH = Column("health", "Health", 1, "state")
+STATE = Column("state", "State", 2, "state")
+SINCE = Column("since", "Since", 6, "time")
+
+
+def _ended(item: Json, now: datetime) -> str:
+    if not (ended := item.get("ended")):
+        return ""
+    how = f", {ended['operation']}" if ended["operation"] else ""
+    return f"{relative(parse_time(ended['time']), now)} by {ended['by']}{how}"
+
+
+def _lease_text(item: Json, now: datetime) -> str:
+    if (lease := item.get("lease")) is None:
+        return ""
+    if not lease["until"]:
+        return "not started"
+    end = parse_time(lease["until"])
+    released = end + timedelta(seconds=lease["slack"])
+    if end >= now:
+        return f"ends {relative(end, now)}"
+    then = "waits for a generator" if released < now else f"released {relative(released, now)}"
+    return f"ended {relative(end, now)}, {then}"
+
+
+LEASE = Column("lease", "Lease", 5, texts_of=_lease_text)
+ENDED = Column("ended", "Ended", 3, texts_of=_ended)
+
+
+def _names(key: str, title: str, rank: int, links: str = "", *, wide: bool = False) -> Column:
+    return Column(key, title, rank, links=links, only_wide=wide)
+
+
+def _command(title: str, words_of: Callable[[Json], list[str]]) -> Column:
+    return Column(
+        "name",
+        title,
+        9,
+        "command",
+        lambda item, now: shlex.join(words_of(item)),
+        only_wide=True,
+    )
+
+
+def _decide(proposal: Json, verb: str) -> list[str]:
+    return ["demandops", verb, proposal["name"], "--commit", proposal["commit"]]
+
+
+def _holds(item: Json, now: datetime) -> list[str]:
+    return [*item["applications"], *item["connections"]]
+
+
+HOLDS = Column("applications", "Holds", 3, texts_of=_holds, links="held")
+
+
+def _health(source: Source, releases: Iterable[str]) -> str | None:
+    # null if no cluster was asked
+    return worst_word(map(source.status, releases)) if source.statuses else None
+
+
+def domains_of(source: Source, nodes: Iterable[str]) -> list[str]:
+    domain_of = source.config.domain_of
+    return sorted({domain_of[id].name for id in nodes if id in domain_of})
+
+
+def nodes_of(claim: Claim) -> tuple[str, ...]:
+    held = claim.held
+    if claim.is_on_application:
+        sources = (topic.source for _, topic in claim.application.all_inputs())
+        delivered = (delivery.node for delivery in claim.application.deliver)
+        return tuple(sorted({*held.nodes, *sources, *delivered}))
+    return tuple(sorted({*held.nodes, *filter(None, (claim.connection.broker,))}))
+
+
+def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> list[str]:
+    return sorted({claim.subject.id for claim in claims if claim.subject.kind is kind})
+
+
+# ---- what is held: demands, applications, claims, leases and requesters ----
+
+
+def _state(source: Source, claims: Sequence[Claim]) -> str:
+    # A claim is held by its demand, kept by an override, or suspended by an override. What has
+    # claims in several states is partly suspended.
+    states = {
+        "suspended"
+        if suspended_by(claim, source.state)
+        else "kept"
+        if claim.keeping_override
+        else "held"
+        for claim in claims
+    }
+    (state,) = states if len(states) == 1 else ("partly suspended",)
+    is_over = any(claim.lease and claim.lease.has_ended(source.now) for claim in claims)
+    return "overdue" if state == "held" and is_over else state
+
+
+def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
+    """Return what items have in common that consist of claims."""
+    leases = [claim.lease for claim in claims if claim.lease]
+    nodes = sorted({node for claim in claims for node in nodes_of(claim)})
+    return {
+        "state": state,
+        "requesters": list(requesters_of(claims)),
+        "nodes": nodes,
+        "domains": domains_of(source, nodes),
+        "since": time_data(min(claim.booked for claim in claims)),
+        # the first that ends
+        "lease": lease_data(min(leases, key=lambda lease: lease.until) if leases else None),
+        "ended": None,
+    }
+
+
+def _demands(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    held = source.claims_of_demands.items()
+    for id, claims in sorted(held, key=lambda pair: (min(c.booked for c in pair[1]), pair[0])):
+        releases = source.releases_of_demands.get(id, [])
+        yield id, (claims, _state(source, claims), releases, _health(source, releases))
+    for waiting in source.state.ledger.waiting.values():
+        yield f"waiting {waiting.demand}", (waiting, "waiting", [], None)
+
+
+def _demand(
+    source: Source,
+    holds: list[Claim] | WaitingDemand,
+    state: str,
+    releases: list[str],
+    health: str | None,
+) -> Json:
+    item: Json
+    if isinstance(holds, WaitingDemand):
+        item = {
+            "name": holds.demand,
+            "state": state,
+            "requests": [holds.put.id],
+            "requesters": list(holds.requesters),
+            "applications": [],
+            "connections": [],
+            "nodes": [],
+            "domains": [],
+            "since": time_data(holds.since),
+            "lease": None,
+            "suspended_by": [],
+            "ended": None,
+        }
+    else:
+        suspending = filter(None, (suspended_by(claim, source.state) for claim in holds))
+        item = {
+            "name": holds[0].demand,
+            **_held(source, holds, state),
+            "requests": sorted({claim.request for claim in holds}),
+            "applications": ids_of(holds, SubjectKind.APPLICATION),
+            "connections": ids_of(holds, SubjectKind.CONNECTION),
+            "suspended_by": sorted({override.path for override in suspending}),
+        }
+    return item | {"releases": releases, "health": health}
+
+
+def _leases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    leased = [(id, values) for id, values in _demands(source) if _first_end(values[0])]
+    yield from sorted(leased, key=lambda pair: (_first_end(pair[1][0]), pair[0]))
+
+
+def _first_end(holds: list[Claim] | WaitingDemand) -> str:
+    if isinstance(holds, WaitingDemand):
+        return ""
+    leases = (lease_data(claim.lease) for claim in holds if claim.lease)
+    # "~" sorts a lease that has not started behind every time
+    return min((lease["until"] or "~" for lease in leases if lease), default="")
+
+
+def _applications(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    releases: defaultdict[str, list[str]] = defaultdict(list)
+    for name, release in source.releases.items():
+        for id in release.applications if isinstance(release, ServiceRelease) else ():
+            releases[id].append(name)
+    ledger = source.state.ledger
+    for id in ledger.subjects(SubjectKind.APPLICATION):
+        claims, own = ledger.application_claims(id), releases[id]
+        yield id, (claims, _state(source, claims), own, _health(source, own))
+
+
+def _application(
+    source: Source,
+    claims: tuple[Claim, ...],
+    state: str,
+    releases: list[str],
+    health: str | None,
+) -> Json:
+    app = claims[0].application
+    return {
+        "name": app.id,
+        "appdef": app.appdef,
+        "node": app.node,
+        "version": app.version or None,
+        **_held(source, claims, state),
+        "demands": [*dict.fromkeys(claim.demand for claim in claims)],
+        "releases": releases,
+        "health": health,
+    }
+
+
+def _claims(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    for claim in sorted(source.state.ledger, key=lambda claim: (str(claim.subject), claim.demand)):
+        yield f"{claim.subject} {claim.demand}", (claim, _state(source, [claim]))
+
+
+def _claim(source: Source, claim: Claim, state: str) -> Json:
+    data = claim_data(claim)
+    return {"name": data["file"], **_held(source, [claim], state), **data}
+
+
+def _requesters(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    claims_of: defaultdict[str, list[Claim]] = defaultdict(list)
+    waiting: defaultdict[str, list[str]] = defaultdict(list)
+    for claim in source.state.ledger:
+        for requester in claim.requesters:
+            claims_of[requester].append(claim)
+    for demand in source.state.ledger.waiting.values():
+        for requester in demand.requesters:
+            waiting[requester].append(demand.demand)
+    for requester in sorted({*claims_of, *waiting}):
+        claims = claims_of[requester]
+        releases = sorted(
+            {
+                name
+                for demand in {claim.demand for claim in claims}
+                for name in source.releases_of_demands.get(demand, ())
+            }
+        )
+        state = _state(source, claims) if claims else "waiting"
+        yield (
+            requester,
+            (requester, claims, state, waiting[requester], releases, _health(source, releases)),
+        )
+
+
+def _requester(
+    source: Source,
+    name: str,
+    claims: list[Claim],
+    state: str,
+    waiting: list[str],
+    releases: list[str],
+    health: str | None,
+) -> Json:
+    held: Json = {"state": state, "nodes": [], "domains": [], "since": None, "lease": None}
+    return {
+        "name": name,
+        **(_held(source, claims, state) if claims else held | {"ended": None}),
+        "demands": sorted({*waiting, *(claim.demand for claim in claims)}),
+        "applications": ids_of(claims, SubjectKind.APPLICATION),
+        "connections": ids_of(claims, SubjectKind.CONNECTION),
+        "releases": releases,
+        "health": health,
+        # who else holds one of these demands
+        "requesters": list(requesters_of(claims)) or [name],
+    }
+
+
+# ---- what runs: releases, services and connections ----
+
+
+def _releases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    for planned in source.running:
+        name = planned.target.name
+        status = source.status(name) if source.statuses else None
+        yield name, (planned.release, planned.claims, status)
+
+
+def _services(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    for name, values in _releases(source):
+        if isinstance(values[0], ServiceRelease):
+            yield name, values
+
+
+def _release(
+    source: Source, release: Release, claims: list[Claim], status: ReleaseStatus | None
+) -> Json:
+    if isinstance(release, ServiceRelease):
+        own = service_entry(source.active, release)
+    else:
+        own = {"service": None, "applications": [], "connections": list(release.connections)}
+    return {
+        **vocabulary.release_data(release),
+        "type": release.node.type,
+        "domains": [release.domain.name],
+        "connections": [],
+        "requesters": list(requesters_of(claims)),
+        "demands": [*dict.fromkeys(claim.demand for claim in claims)],
+        **vocabulary.version_data(release, source.active.ledger),
+        **own,
+        **status_data(status),
+    }
+
+
+def status_data(status: ReleaseStatus | None) -> Json:
+    """Return what a cluster says of a release; null if none was asked."""
+    if status is None:
+        status, word = ReleaseStatus(Health("waiting")), None
+    else:
+        word = word_of(status)
+    return {
+        "seen": status.seen or None,
+        "health": word,
+        "since": time_data(since_of(status)),
+        "failing": status.health.failing,
+        "object": status.health.object or None,
+        "reason": status.health.reason or None,
+    }
+
+
+def _connections(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    ledger, clients_of = source.active.ledger, defaultdict[str, list[str]](list)
+    for name, release in source.releases.items():
+        if not isinstance(release, ServiceRelease):
+            for id in release.connections:
+                clients_of[id].append(name)
+    for id in ledger.subjects(SubjectKind.CONNECTION):
+        if claims := ledger.connection_claims(id):  # that are not suspended
+            yield id, (claims, clients_of[id], _health(source, clients_of[id]))
+
+
+def _connection(
+    source: Source, claims: tuple[Claim, ...], releases: list[str], health: str | None
+) -> Json:
+    entry = connection_entry(claims)
+    nodes = [entry["source"], entry["target"]]
+    return {
+        "name": claims[0].subject.id,
+        **entry,
+        "nodes": nodes,
+        "domains": domains_of(source, nodes),
+        "demands": [*dict.fromkeys(claim.demand for claim in claims)],
+        "releases": releases,
+        "health": health,
+    }
+
+
+def _asked_topics(topics: dict[str, list[str]], item: Json) -> list[str]:
+    # a topic is followed by its requesters if the item has others too
+    return [
+        topic if who == item["requesters"] else f"{topic} ({', '.join(who)})"
+        for topic, who in topics.items()
+    ]
+
+
+def version_texts(item: Json, *_: object) -> list[str]:
+    # of what `vocabulary.version_data` returns
+    asked = item["versions_asked"].items()
+    return [
+        item["application_version"] or item["version"] or "",
+        *(f"{version} requested by {', '.join(requesters)}" for version, requesters in asked),
+    ]
+
+
+def _reason(item: Json, now: datetime) -> str:
+    return f"{item['object']}: {item['reason']}" if item["object"] else item["reason"] or ""
+
+
+# ---- where it runs, and by which rules: nodes, domains and application definitions ----
+
+
+def _nodes(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    # those of the inventory and of claims, and what uses each, if only as a source of inputs
+    running: defaultdict[str, list[str]] = defaultdict(list)
+    for name, release in source.releases.items():
+        running[release.node.id].append(name)
+    needing: defaultdict[str, list[Claim]] = defaultdict(list)
+    for claim in source.state.ledger:
+        for id in nodes_of(claim):
+            needing[id].append(claim)
+    # A claim may need a node that a person removed from the inventory.
+    for id in sorted({*source.config.nodes, *needing}):
+        yield id, (id, needing[id], sorted(running[id]), _health(source, running[id]))
+
+
+def _node(
+    source: Source, id: str, claims: list[Claim], releases: list[str], health: str | None
+) -> Json:
+    node, domain = source.config.nodes.get(id), source.config.domain_of.get(id)
+    state = "open" if node else "not in the inventory"
+    return {
+        "name": id,
+        "state": "drained" if node and node.drained else state,
+        "type": node.type if node else None,
+        "cluster": node.cluster if node else None,
+        "domain": domain.name if domain else None,
+        "drained": bool(node and node.drained),
+        "capabilities": list(node.capabilities) if node else [],
+        "properties": dict(node.properties) if node else {},
+        "position": node.position.model_dump() if node and node.position else None,
+        "releases": releases,
+        "applications": ids_of(claims, SubjectKind.APPLICATION),
+        "connections": ids_of(claims, SubjectKind.CONNECTION),
+        "demands": sorted({claim.demand for claim in claims}),
+        "requesters": list(requesters_of(claims)),
+        "health": health,
+    }
+
+
+def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    nodes: defaultdict[str, list[str]] = defaultdict(list)
+    for id, domain in sorted(source.config.domain_of.items()):
+        nodes[domain.name].append(id)
+    for name, domain in sorted(source.config.domains.items()):
+        clusters = {source.config.nodes[id].cluster for id in nodes[name]}
+        item = {
+            "name": name,
+            "namespace": domain.namespace,
+            "approval": domain.approval,
+            "when_full": domain.when_full,
+            "network": domain.network,
+            "rules": len(domain.rules),
+            "clusters": sorted(clusters),
+            "nodes": nodes[name],
+            "file": source.config.file_of(DOMAINS_FILE, name),
+        }
+        yield name, (item,)
+
+
+def _appdefs(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    held: defaultdict[str, list[str]] = defaultdict(list)
+    ledger = source.state.ledger
+    for id in ledger.subjects(SubjectKind.APPLICATION):
+        if app := ledger.application(id):
+            held[app.appdef].append(id)
+    for name, services in sorted(source.config.services.items()):
+        item = {
+            "name": name,
+            "services": sorted(services),
+            "charts": sorted({service.chart for service in services.values()}),
+            "applications": held[name],
+            "file": f"appdefs/{name}/appdef.yaml",
+        }
+        yield name, (item,)
+
+
+# ---- what people decide, and what happened: overrides, proposals and events ----
+
+
+def _overrides(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    for entry in source.overrides:
+        yield entry.override.name, (entry,)
+
+
+def _override(source: Source, entry: Entry) -> Json:
+    return {
+        **vocabulary.override_data(entry.override),
+        "state": entry.state,
+        "releases": [vocabulary.release_data(release) for release in entry.releases],
+        "claims": [claim_data(claim) for claim in entry.claims],
+    }
+
+
+def effect_texts(override: Json, *_: object) -> list[str]:
+    shown = ("version", "replicas", "node")
+    listed = ("images", "values")
+    return [
+        f"{name} {value}"
+        if name in shown
+        else f"{name} {', '.join(value)}"
+        if name in listed
+        else name
+        for name, value in override["effects"].items()
+    ]
+
+
+def _affected(item: Json, now: datetime) -> list[str]:
+    releases = dict.fromkeys(release["name"] for release in item["releases"])
+    return [*releases, *dict.fromkeys(subject_text(claim) for claim in item["claims"])]
+
+
+def _proposals(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    for proposal in source.proposals:
+        data = asdict(proposal) | {"since": time_data(proposal.since)}
+        link = source.proposal_links.get(proposal.branch)
+        yield proposal.branch, ({"name": proposal.branch, **data, "link": link},)
+
+
+def _events(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    for entry in islice(source.reader().log(source.commit), MOST_COMMITS):
+        data = vocabulary.commit_data(entry)
+        who = ", ".join(data["requesters"]) or data["author"]
+        yield entry.commit, ({"name": entry.commit, **data, "who": who},)
+
+
+_RELEASE = Column("name", "Release", links="release")
+_NODE = Column("node", "Node", 3, links="node")
+_VERSION = Column("version", "Version", 7, texts_of=version_texts)
+_CLUSTER = Column("cluster", "Cluster", 8)
+_SEEN = Column("seen", "Seen", 9, texts_of=lambda item, now: (item["seen"] or "")[:10])
+_FOR = Column(
+    "applications",
+    "For",
+    5,
+    texts_of=lambda item, now: item["applications"] or item["connections"],
+)
+
+KINDS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in (
+        Kind(
+            "demands",
+            "What requesters hold, until they release it or its lease ends.",
+            (
+                Column("name", "Demand", links="demand"),
+                STATE,
+                HEALTH,
+                ENDED,
+                REQUESTERS,
+                HOLDS,
+                LEASE,
+                SINCE,
+                _names("requests", "Requests", 9, wide=True),
+                _names("nodes", "Nodes", 9, "node", wide=True),
+                _names("suspended_by", "Suspended by", 9, wide=True),
+            ),
+            _demands,
+            _demand,
+            trailer="Demand-Id",
+        ),
+        Kind(
+            "applications",
+            "What is held, each once, however many demands hold it.",
+            (
+                Column("name", "Application", links="application"),
+                STATE,
+                HEALTH,
+                ENDED,
+                Column("appdef", "Type", 3),
+                Column("node", "Node", 4, links="node"),
+                REQUESTERS,
+                Column("version", "Version", 7),
+                SINCE,
+                _names("demands", "Demands", 9, "demand", wide=True),
+                _names("releases", "Releases", 9, "release", wide=True),
+            ),
+            _applications,
+            _application,
+            lambda item: {"type": [item["appdef"] or ""]},
+            trailer="Application",
+        ),
+        Kind(
+            "releases",
+            "Helm releases and the clients of connections, each shared by all who need it.",
+            (
+                _RELEASE,
+                HEALTH,
+                Column("reason", "Reason", 1, texts_of=_reason),
+                _NODE,
+                Column("requesters", "Requesters", 4, links="requester"),
+                _FOR,
+                Column("since", "Since", 6, "time"),
+                _VERSION,
+                _CLUSTER,
+                _SEEN,
+            ),
+            _releases,
+            _release,
+        ),
+        Kind(
+            "services",
+            "Releases of services, one for each service on a node, shared by all who need it.",
+            (
+                _RELEASE,
+                HEALTH,
+                Column("service", "Service", 6),
+                _NODE,
+                REQUESTERS,
+                Column(
+                    "source",
+                    "For",
+                    5,
+                    texts_of=lambda item, now: item["source"] or item["applications"],
+                ),
+                _VERSION,
+                _CLUSTER,
+                Column(
+                    "inputs",
+                    "Takes in",
+                    9,
+                    texts_of=lambda item, now: [
+                        text
+                        for topics in item["inputs"].values()
+                        for text in _asked_topics(topics, item)
+                    ],
+                    only_wide=True,
+                ),
+                Column(
+                    "parameters",
+                    "Parameters",
+                    9,
+                    texts_of=lambda item, now: [
+                        f"{n} = {v}" for n, v in item["parameters"].items()
+                    ],
+                    only_wide=True,
+                ),
+            ),
+            _services,
+            _release,
+            lambda item: {"release": [item["name"]]},
+        ),
+        Kind(
+            "connections",
+            "Topics that are carried from one node to another.",
+            (
+                Column("name", "Connection", links="connection"),
+                HEALTH,
+                Column("type", "Type", 4),
+                Column("source", "From", 2, links="node"),
+                Column("target", "To", 2, links="node"),
+                REQUESTERS,
+                Column(
+                    "topics",
+                    "Topics",
+                    5,
+                    texts_of=lambda item, now: _asked_topics(carried_topics(item), item),
+                ),
+                _names("releases", "Releases", 9, "release", wide=True),
+            ),
+            _connections,
+            _connection,
+            lambda item: {
+                "topic": carried_topics(item),
+                "from": [item["source"]],
+                "to": [item["target"]],
+            },
+            trailer="Connection",
+        ),
+        Kind(
+            "leases",
+            "Demands that end unless their requester renews them. The first to end comes first.",
+            (
+                Column("name", "Demand", links="demand"),
+                Column(
+                    "lease",
+                    "Ends",
+                    1,
+                    texts_of=lambda item, now: _lease_text(item, now).removeprefix("ends "),
+                ),
+                REQUESTERS,
+                Column(
+                    "term",
+                    "Term",
+                    3,
+                    texts_of=lambda item, now: duration_text(item["lease"]["seconds"]),
+                ),
+                HOLDS,
+            ),
+            _leases,
+            _demand,
+            lambda item: {"demand": [item["name"]]},
+        ),
+        Kind(
+            "nodes",
+            "The machines of the inventory, and what needs each of them.",
+            (
+                Column("name", "Node", links="node"),
+                STATE,
+                HEALTH,
+                Column("type", "Type", 3),
+                Column("domain", "Domain", 4),
+                Column("cluster", "Cluster", 6),
+                Column(
+                    "releases", "Releases", 5, texts_of=lambda item, now: str(len(item["releases"]))
+                ),
+                REQUESTERS,
+                _names("capabilities", "Capabilities", 9, wide=True),
+                Column(
+                    "properties",
+                    "Properties",
+                    9,
+                    texts_of=lambda item, now: [
+                        f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
+                    ],
+                    only_wide=True,
+                ),
+            ),
+            _nodes,
+            _node,
+        ),
+        Kind(
+            "requesters",
+            "Who demands something, and what each holds.",
+            (
+                Column("name", "Requester", links="requester"),
+                STATE,
+                HEALTH,
+                ENDED,
+                Column("demands", "Demands", 3, links="demand"),
+                HOLDS,
+                LEASE,
+                SINCE,
+                _names("nodes", "Nodes", 9, "node", wide=True),
+            ),
+            _requesters,
+            _requester,
+            trailer="Requester",
+        ),
+        Kind(
+            "domains",
+            "Access domains: nodes of one owner, and what the policy says about them.",
+            (
+                Column("name", "Domain"),
+                Column("approval", "Approval", 2),
+                Column("when_full", "When full", 5),
+                Column("namespace", "Namespace", 4),
+                Column("clusters", "Clusters", 3),
+                Column("nodes", "Nodes", 1, links="node"),
+                Column("rules", "Rules", 6),
+                Column("file", "File", 9, only_wide=True),
+            ),
+            _domains,
+        ),
+        Kind(
+            "appdefs",
+            "Application definitions: the types of application that can be demanded.",
+            (
+                Column("name", "Type"),
+                Column("services", "Services", 1),
+                Column("applications", "Applications", 2, links="application"),
+                Column("charts", "Charts", 3),
+                Column("file", "File", 9, only_wide=True),
+            ),
+            _appdefs,
+        ),
+        Kind(
+            "claims",
+            "What one demand holds of one subject.",
+            (
+                Column(
+                    "subject",
+                    "Subject",
+                    texts_of=lambda item, now: [
+                        subject_text(item),
+                        *(f"held for {id}" for id in item["held_for"]),
+                    ],
+                ),
+                STATE,
+                REQUESTERS,
+                Column("demand", "Demand", 3, links="demand"),
+                LEASE,
+                SINCE,
+                Column("request", "Request", 9, only_wide=True),
+                Column("file", "File", 9, only_wide=True),
+            ),
+            _claims,
+            _claim,
+            lambda item: {
+                item["subject"]["kind"]: [item["subject"]["id"]],
+                "kind": [item["subject"]["kind"]],
+            },
+        ),
+        Kind(
+            "overrides",
+            "What runs otherwise than demanded, and why.",
+            (
+                Column("name", "Override", links="override"),
+                STATE,
+                Column("effects", "Does", 2, texts_of=effect_texts),
+                Column("until", "Until", 3, "time"),
+                Column("owner", "Owner", 4),
+                Column("releases", "To", 5, texts_of=_affected),
+                Column("reason", "Reason", 6),
+                Column("priority", "Priority", 9, only_wide=True),
+                _command("End it", lambda item: ["demandops", "override", "end", item["name"]]),
+            ),
+            _overrides,
+            _override,
+            lambda item: {
+                "node": [release["node"] for release in item["releases"]],
+                "domain": [release["domain"] for release in item["releases"]],
+                "cluster": [release["cluster"] for release in item["releases"]],
+                "release": [release["name"] for release in item["releases"]],
+                "requester": [who for claim in item["claims"] for who in claim["requesters"]],
+                "demand": [claim["demand"] for claim in item["claims"]],
+            },
+        ),
+        Kind(
+            "proposals",
+            "Changes that a person approves by merging a branch, or refuses by deleting it.",
+            (
+                Column("name", "Branch"),
+                Column("commit", "Commit", texts_of=lambda item, now: item["commit"][:10]),
+                REQUESTERS,
+                Column("since", "Since", 3, "time"),
+                Column("summary", "What", 1),
+                Column("required_by", "Required by", 4),
+                Column("link", "Link", 5),
+                _names("demands", "Demands", 9, "demand", wide=True),
+                _command("See", lambda item: ["git", "diff", f"origin/main...{item['commit']}"]),
+                _command("Approve", lambda item: _decide(item, "approve")),
+                _command("Refuse", lambda item: _decide(item, "reject")),
+            ),
+            _proposals,
+        ),
+        Kind(
+            "events",
+            "The newest commits, by demands, people and the generator.",
+            (
+                Column("time", "When", 0, "time"),
+                Column("operation", "Operation", 3),
+                Column("who", "Who", 1),
+                Column("summary", "What", 2),
+                Column("commit", "Commit", 4, texts_of=lambda item, now: item["commit"][:10]),
+                Column("why", "Why", 9, only_wide=True),
+            ),
+            _events,
+        ),
+    )
+}
