@@ -55,6 +55,10 @@ COMMANDS = {
         "changes.ledger_change",
         "Stop one demand, or an application for all who demand it.",
     ),
+    "reconcile": (
+        "changes.reconcile",
+        "Let Flux or Argo CD fetch now, and not at its next interval.",
+    ),
     "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),
     "resume": ("changes.override", "Run suspended applications and connections again."),
     "revert": ("changes.edit", "Undo a person's commit, by a new commit."),
