@@ -45,6 +45,7 @@ COMMANDS = {
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
     "log": ("queries.log", "List the commits of the state repo, newest first."),
+    "may": ("queries.may", "Say whether a requester may demand an application, and why."),
     "new": ("authoring.new", "Write a new application or image."),
     "override": ("changes.override", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
