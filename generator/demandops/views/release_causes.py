@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from demandops.base.naming import Subject
-from demandops.decide.planning.planner import denied_release, plan
+from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import all_keys, keys_of, takes
 from demandops.model.config.config import DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
-from demandops.model.config.override import OVERRIDES_ROOT, Override
+from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger.claim import Claim, demand_id
 from demandops.model.ledger.ledger import Ledger, World
@@ -18,10 +18,6 @@ from demandops.model.release import Release, ServiceRelease, claims_of
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
     keys = keys_of(world, subject) if subject else all_keys(world)
     yield from filter(None, (plan(world, key) for key in keys))
-
-
-def release_named(world: World, name: str) -> Release | None:
-    return next((release for release in releases(world) if release.name == name), None)
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
@@ -69,8 +65,3 @@ def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]
         (file_of(NODES_FILE, node.id), node.id, f"in cluster {node.cluster}"),
         (file_of(DOMAINS_FILE, domain.name), domain.name, f"namespace {domain.namespace}"),
     ]
-
-
-def denied_release_named(world: World, name: str) -> tuple[Release, Override] | None:
-    denied = (denied_release(world, key) for key in all_keys(world))
-    return next((pair for pair in denied if pair and pair[0].name == name), None)
