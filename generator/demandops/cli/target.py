@@ -115,7 +115,7 @@ _VARIABLE = "DEMANDOPS_STATE_REPO"
 _NAME = "demandops.context-name"
 _CONTEXT = "demandops.context"
 _BEHIND = "demandops.checkout-behind"
-_NO_STATE_REPO = (
+NO_STATE_REPO = (
     "Which state repo? Give --state-repo, run the command in a checkout, or name a state repo "
     "once: demandops config set NAME --state-repo URL_OR_DIR"
 )
@@ -133,6 +133,8 @@ def _checkout() -> Path | None:
 
 def _default_repo(*, writes: bool = False) -> str | None:
     ctx, around, content = click.get_current_context(), _checkout(), read_contexts()
+    if ctx.params.get("via") == "ros" or ctx.params.get("hold"):
+        return None  # a demand that is sent over ROS needs no state repo
     # clusters and signing key of a context apply only to its own state repo
     context: Context | None = None
     if _NAME in ctx.meta:
@@ -186,7 +188,9 @@ _context_option = click.option(
 )
 
 
-def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Command], Command]:
+def _state_repo(
+    default: Callable[[], str | None], where: str, *, required: bool = True
+) -> Callable[[Command], Command]:
     def address(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
         from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT
         path = Path(value or "")
@@ -202,9 +206,9 @@ def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Comm
                     ctx,
                 )
             value = default()
-        if value is None:
-            raise click.UsageError(_NO_STATE_REPO, ctx)
-        return value
+        if value is None and required:
+            raise click.UsageError(NO_STATE_REPO, ctx)
+        return value or ""
 
     option = click.option(
         "--state-repo",
@@ -226,6 +230,13 @@ state_repo_option = _state_repo(_default_repo, "the checkout that you are in")
 # If the checkout has no remote, the default with `--dry-run` is the checkout itself.
 writable_repo_option = _state_repo(
     partial(_default_repo, writes=True), "the remote of the checkout that you are in"
+)
+
+# The same of a command that can also do without: then it is empty.
+optional_repo_option = _state_repo(
+    partial(_default_repo, writes=True),
+    "the remote of the checkout that you are in",
+    required=False,
 )
 
 dry_run_option = click.option(

@@ -192,7 +192,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:
-    """Explain why something runs or ran, who decided it, and what it held.
+    """Explain why something runs or ran, and who decided it.
 
     The command shows the requesters, the configuration and overrides that apply, open proposals,
     who approved or rejected, and the commits. NAME is the name of a thing of any kind that --kind
