@@ -72,7 +72,7 @@ def lines_of(answer: Json) -> Iterator[str]:
         yield f"  denied by   {_override_text(answer['denied_by'])}"
     for release in answer.get("releases", ()):
         word = _OF_RELEASES.get(answer["kind"], "runs")
-        yield f"  {word:11} {release['name']} on {release['node']} ({release['file']})"
+        yield f"  {word:11} {release['name']} on {release['node']}"
     if answer.get("claims"):
         yield from _claim_lines(answer["claims"])
     if answer.get("shaped_by"):
