@@ -16,12 +16,13 @@ from demandops.base.errors import InvalidInput, StateRepoError, suggestion
 from demandops.base.naming import SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.strict_yaml import located_in
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import all_keys
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, parse_file
 from demandops.repo import reader
 from demandops.repo.git.remote_repository import checkout_around, is_url, origin_of
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
-from demandops.views import release_causes
 
 # ---- contexts: the fleets that a person works with ----
 #
@@ -310,7 +311,8 @@ def _names(repo: Reader, kind: str) -> Iterator[str]:
         return
     world = repo.snapshot().state
     if kind == "releases":
-        yield from (release.name for release in release_causes.releases(world))
+        running = (plan(world, key) for key in all_keys(world))
+        yield from (release.name for release in running if release)
     elif kind in ("requesters", "demands"):
         yield from world.ledger.indexed_names(kind[:-1])
     elif kind in ("applications", "connections"):

@@ -16,8 +16,7 @@ from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_message import GENERATOR_NAME
-from demandops.views import release_causes
-from demandops.views.source import Source, since_of, word_of
+from demandops.views.source import Source, claims_behind, since_of, word_of
 
 Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
 
@@ -133,7 +132,7 @@ def _denied(source: Source) -> Iterator[Cause]:
         yield _denial(source, override, thing, what, "is booked", claims, applications)
     # the claims that need a denied release are not suspended as a whole
     for release, override in source.denied:
-        claims = release_causes.claims_behind(source.active.ledger, release)
+        claims = claims_behind(source.active.ledger, release)
         served = release.applications if isinstance(release, ServiceRelease) else ()
         what, thing = release.description, ("release", release.name)
         yield _denial(source, override, thing, what, "is needed", claims, served, release.name)

@@ -72,7 +72,7 @@ def lines_of(answer: Json) -> Iterator[str]:
         yield f"  denied by   {_override_text(answer['denied_by'])}"
     for release in answer.get("releases", ()):
         word = _OF_RELEASES.get(answer["kind"], "runs")
-        yield f"  {word:11} {release['name']} on {release['node']} ({release['file']})"
+        yield f"  {word:11} {release['name']} on {release['node']}"
     if answer.get("claims"):
         yield from _claim_lines(answer["claims"])
     if answer.get("shaped_by"):
@@ -188,7 +188,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
     show_default=True,
     help="List at most this many of the commits that changed the object.",
 )
-@json_output.output_option
+@json_output.output_formats("text", "json", "yaml", "jsonpath=…")
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:
