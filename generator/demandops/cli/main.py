@@ -45,6 +45,7 @@ COMMANDS = {
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
     "log": ("queries.log", "List the commits of the state repo, newest first."),
+    "may": ("queries.may", "Say whether a requester may demand an application, and why."),
     "new": ("authoring.new", "Write a new application or image."),
     "override": ("changes.override", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
@@ -54,6 +55,10 @@ COMMANDS = {
     "release": (
         "changes.ledger_change",
         "Stop one demand, or an application for all who demand it.",
+    ),
+    "reconcile": (
+        "changes.reconcile",
+        "Let Flux or Argo CD fetch now, and not at its next interval.",
     ),
     "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),
     "resume": ("changes.override", "Run suspended applications and connections again."),
