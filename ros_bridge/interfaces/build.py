@@ -63,12 +63,13 @@ check_for_type_support(GetBookkeeping)
 
 
 class StageFailed(Exception):
-    """Raised when a command of the build fails; its output is at the end of the log."""
+    """Raised when a command of the build fails; a copy of its log stays beside the record."""
 
     def __init__(self, stage: str, log: Path) -> None:
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
         tail = "\n".join(f"    {line}" for line in lines[-TAIL_LINES:])
-        super().__init__(f"{tail}\nfailed: {stage}\nthe full log: {log}")
+        kept = shutil.copy(log, RECORD.with_suffix(".log"))
+        super().__init__(f"{tail}\nfailed: {stage}\nthe full log: {kept}")
 
 
 def main() -> int:
@@ -85,15 +86,8 @@ def main() -> int:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 # Another build may have finished while this one waited.
                 if not is_current(digest):
-                    folder = Path(tempfile.mkdtemp(prefix="demandops-interfaces-"))
-                    try:
-                        build(folder, digest)
-                    except StageFailed:  # it names the log, which stays
-                        raise
-                    except BaseException:
-                        shutil.rmtree(folder, ignore_errors=True)
-                        raise
-                    shutil.rmtree(folder, ignore_errors=True)
+                    with tempfile.TemporaryDirectory(prefix="demandops-interfaces-") as folder:
+                        build(Path(folder), digest)
                     return 0
         print(f"interfaces: up to date in {PREFIX}")
     except StageFailed as failure:

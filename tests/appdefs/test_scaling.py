@@ -8,10 +8,9 @@ from typing import Any, Literal
 
 import pytest
 from demandops.base.errors import InvalidInput
-from demandops.decide.changeset import render_trial_demands
 from demandops.decide.override_report import override_report, warnings
 from demandops.decide.planning.release_keys import affected_keys
-from demandops.decide.state import rendered_files
+from demandops.decide.state import rendered_files, try_configuration
 from demandops.model.release import ServiceKey
 
 from tests.appdefs.test_recorder import ADDITIONS
@@ -178,7 +177,7 @@ def test_what_does_not_go_with_an_autoscaler_is_a_fault(
     repo = books(AUTOSCALED, **files)
     for render in (
         lambda: repo.send(demand()),
-        lambda: render_trial_demands(repo.state, repo.state.evaluate),
+        lambda: try_configuration(repo.state),
     ):
         with pytest.raises(InvalidInput) as invalid:
             render()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 
-_VOID = {"meta", "link", "input", "img", "br"}
+_VOID = {"meta", "link", "input", "img", "br", "wbr"}
 _APART = {"td", "th", "p", "li", "dt", "dd", "h1", "h2", "h3", "summary"}
 
 

@@ -152,7 +152,9 @@ def test_a_failed_stage_shows_its_log_and_is_not_taken_for_done(
     fail.touch()
     assert script.main() == 3
     error = capsys.readouterr().err
-    (log,) = tmp_path.glob(f"demandops-interfaces-*/{OURS}.log")
+    log = script.RECORD.with_suffix(".log")
+    assert log.read_text().endswith("no space left\n")
+    assert list(tmp_path.glob("demandops-interfaces-*")) == []
     assert error.endswith(
         f"    as --{stage}\n    no space left\nfailed: {stage} {OURS}\nthe full log: {log}\n"
     )

@@ -71,7 +71,7 @@ BUILD = Path(__file__).parents[2] / "build" / "page"
 VIEWS = [
     *("", "map", "map?q=vehicle00", "demands", "services", "connections", "leases", "timeline"),
     *("timeline?at=HEAD~2", f"release?name={FAILING}", "demand?id=vehicle01-to-cloud"),
-    "overrides",
+    *("overrides", "thing?kind=node&name=edge", "thing?kind=requester&name=vehicle00"),
 ]
 SERIOUS = ("serious", "critical")
 
@@ -107,12 +107,13 @@ def test_nothing_overflows_and_no_word_is_broken(visit: Visits, width: int) -> N
         assert page.evaluate(BROKEN_WORDS) == [], view
 
 
-# The words of cells that stand in two lines, without those with a hyphen or slash, where lines may
-# end, and without long ones: the ids of releases and commits.
+# The texts that are wider than their cells, and the words that stand in two lines, without those
+# with a hyphen or slash, where lines may end, and without long ones: the ids of releases.
 BROKEN_WORDS = r"""
 () => {
   const broken = [];
-  for (const cell of document.querySelectorAll("td, th, h1, h2, h3, .badge, .figures li")) {
+  for (const cell of document.querySelectorAll("td, th, h1, h2, h3, dd, .badge, .figures li")) {
+    if (cell.clientWidth && cell.scrollWidth > cell.clientWidth + 1) broken.push(cell.textContent);
     const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
     for (let text = walker.nextNode(); text; text = walker.nextNode()) {
       for (const word of text.data.matchAll(/[\p{L}\p{N}_.]+/gu)) {
@@ -185,14 +186,14 @@ def test_a_keyboard_reaches_everything(visit: Visits) -> None:
         if page.evaluate("document.activeElement.classList.contains('node')"):
             break
     page.keyboard.press("Enter")
-    page.wait_for_url("**/services?**")
+    page.wait_for_url("**/thing?**")
 
 
-def test_a_node_of_the_map_links_to_its_services(visit: Visits) -> None:
+def test_a_node_of_the_map_links_to_its_page(visit: Visits) -> None:
     page = visit().open("/map")
     page.locator(".node", has_text="edge").first.click()
-    page.wait_for_url("**/services?q=node%3Dedge")
-    expect(page.locator("tbody tr")).to_have_count(3)
+    page.wait_for_url("**/thing?kind=node&name=edge")
+    expect(page.locator("h1")).to_contain_text("Node edge")
 
 
 def test_a_dot_of_the_time_line_opens_the_books_of_then(visit: Visits) -> None:
@@ -262,15 +263,15 @@ def test_the_page_follows_again_when_its_server_is_back(browser: Browser, fleet:
     server.close()
 
 
-def test_a_demand_that_ended_is_not_shown_any_longer(browser: Browser, fleet: Story) -> None:
+def test_a_demand_that_ended_is_told_at_once(browser: Browser, fleet: Story) -> None:
     book(fleet.generator, leased("short", "vehicle03"))
     fleet.wait_followed()
     visit = Visit(browser, fleet.url)
     page = visit.open("/demand?id=short")
-    expect(page.locator("h1")).to_have_text("Demand short")
+    expect(page.locator("h1")).to_have_text("Demand short held")
     expect(page.locator("#live")).to_have_text("live")
     book(fleet.generator, released("short", "vehicle03"))
-    expect(page.locator("h1")).to_have_text("Nothing to show")
+    expect(page.locator("h1")).to_have_text("Demand short gone")
     visit.close()
 
 

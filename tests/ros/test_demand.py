@@ -16,8 +16,7 @@ import yaml
 from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops_interfaces.action import Demand
 from demandops_interfaces.msg import Bookkeeping
-from demandops_ros import Answer, DemandClient, DemandError
-from demandops_ros.demand_command import _print_answer
+from demandops_ros import DemandClient, DemandError
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
@@ -235,16 +234,19 @@ def test_the_command_line_sends_holds_and_gives_up(
     file.write_text(yaml.safe_dump(document | {"request": 5}))
     wrong = demandops("demand", file)
     assert wrong.code == 1
-    assert wrong.err.startswith(f"error: {file}: is not a demand: The 'request_id' field must be")
+    assert f"{file}: request 0 '' refused\n  line " in wrong.err
     file.write_text(yaml.safe_dump(document))
     sent = demandops("demand", file, "--output", "json")
     assert sent.code == 0, sent.err
-    assert sent.json()["outcome"] == "booked"
-    assert demandops("demand", file).out.startswith("unchanged in ")
-    assert demandops("demand", file, "--release").out.startswith("released in ")
+    (row,) = sent.json()
+    assert (row["request"], row["outcome"], row["reached"]) == ("typed", "booked", "pushed")
+    again = demandops("demand", file)
+    assert again.out.startswith(f"{file}: request 0 'typed' unchanged in ")
+    assert again.err.endswith("(by a node, over ROS)\n")
+    assert "'typed' released in " in demandops("demand", file, "--release").out
     gone = demandops("demand", file, "--release", "--output", "json")
-    assert [each["code"] for each in gone.json()["faults"]] == ["not-held"]
-    assert gone.code == 1 and "not-held: demand: 'typed' holds nothing" in gone.err
+    assert [each["code"] for each in gone.json()[0]["faults"]] == ["not-held"]
+    assert gone.code == 1
     holding = subprocess.Popen(
         [sys.executable, "-m", "demandops.cli.main", "demand", str(file), "--hold"],
         env=shared.environment,
@@ -257,10 +259,5 @@ def test_the_command_line_sends_holds_and_gives_up(
     holding.send_signal(signal.SIGINT)
     out, err = holding.communicate(timeout=PATIENCE_S)
     assert holding.returncode == 0, err
-    assert out.startswith("booked in ") and err.endswith("released\n")
+    assert "'typed' booked in " in out and "held until Ctrl-C\nreleased\n" in err
     assert operations(shared, before) == [*held, "release"]
-
-
-def test_an_answer_without_a_commit_names_none(capfd: pytest.CaptureFixture[str]) -> None:
-    _print_answer(Answer("released", "", 0.0, ("probably",), "pushed"), "text")
-    assert capfd.readouterr() == ("released\n", "warning: probably\n")

@@ -34,7 +34,7 @@ NOT_SHOWN = _LISTED["not shown"]
 
 PROPOSED = ("for-each-ref", "--format=%(objectname)", "refs/heads/demand")
 _HEX = re.compile(
-    r"\b(?=[0-9a-f]*\d)[0-9a-f]{10}(?:[0-9a-f]{30})?\b|(?<=after commit )[0-9a-f]{12}"
+    r"\b(?=[0-9a-f]*\d)[0-9a-f]{10}(?:[0-9a-f]{30})?\b|(?<!\S)(?=[0-9a-f]*\d)[0-9a-f]{12}\b"
 )
 _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 

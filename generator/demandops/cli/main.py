@@ -15,13 +15,15 @@ from contextlib import suppress
 from enum import IntEnum
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import click
 
 from demandops import __version__
-from demandops.base.errors import DemandOpsError, InvalidInput, Unsound
+from demandops.base.errors import DemandOpsError, InvalidInput, Unsound, suggestion
 from demandops.base.quoting import OneLineFormatter, one_line
 from demandops.cli.output import OutputLost, done, errors, open_streams, show_slow
+from demandops.repo.git import child_processes
 
 # The package of each command's module, and the short help, which `--help` shows without importing
 # the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.
@@ -32,16 +34,18 @@ COMMANDS = {
     "completion": ("program", "Print the completion script for a shell."),
     "config": ("program", "List, set and choose contexts: the fleets that you work with."),
     "decommission": ("changes.ledger_change", "Release all claims of a node or a requester."),
-    "demand": ("demandops_ros.demand_command", "Send a demand to a running node."),
+    "demand": ("changes.demand", "Demand what files ask for: book it, or send it to a node."),
     "detect": (
         "demandops_ros.detector.detect_command",
         "Watch topics, and send the demands that rules ask for.",
     ),
     "diff": ("queries.diff", "Show the differences between two commits."),
+    "drain": ("changes.edit", "Take a node out of use: nothing new is placed there."),
     "get": ("queries.get", "List demands, releases, nodes, overrides and so on."),
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
     "log": ("queries.log", "List the commits of the state repo, newest first."),
+    "may": ("queries.may", "Say whether a requester may demand an application, and why."),
     "new": ("authoring.new", "Write a new application or image."),
     "override": ("changes.override", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
@@ -52,9 +56,13 @@ COMMANDS = {
         "changes.ledger_change",
         "Stop one demand, or an application for all who demand it.",
     ),
+    "reconcile": (
+        "changes.reconcile",
+        "Let Flux or Argo CD fetch now, and not at its next interval.",
+    ),
     "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),
-    "request": ("changes.request", "Book demand requests from files."),
     "resume": ("changes.override", "Run suspended applications and connections again."),
+    "revert": ("changes.edit", "Undo a person's commit, by a new commit."),
     "rollback": (
         "changes.ledger_change",
         "Restore the claims of an earlier commit, by a new commit.",
@@ -63,12 +71,59 @@ COMMANDS = {
     "serve": ("demandops_ros.serve_command", "Run the ROS 2 node that accepts demands."),
     "status": ("queries.status", "Show the state of each release on its cluster."),
     "suspend": ("changes.override", "Stop applications and connections; their claims stay booked."),
+    "undrain": ("changes.edit", "Use a drained node again."),
     "upgrade": ("state_repo", "Render everything again, in one commit."),
     "verify": ("state_repo", "Render commits again from their ledger and compare the bytes."),
     "version": ("program", "Print the versions of the program and of its formats."),
     "watch": ("queries.live", "Show releases, demands and the latest commits live."),
     "web": ("queries.live", "Show the state repo on a web page."),
-    "why": ("queries.why", "Explain why something runs or ran."),
+    "why": ("queries.why", "Explain why something runs or ran, and who decided it."),
+}
+
+# Other names of commands.
+ALIASES = {
+    "describe": ["why"],
+    "events": ["get", "events"],
+    "request": ["demand", "--via", "git"],
+}
+
+# What people look for by the words of other programs.
+_LEADS = {
+    "apply": "demand FILE, or git push for configuration",
+    "auth": "may REQUESTER demand APPLICATION",
+    "can-i": "may REQUESTER demand APPLICATION",
+    "cancel": "release DEMAND",
+    "cordon": "drain NODE",
+    "create": "demand FILE, or override create NAME",
+    "delete": "release DEMAND|APPLICATION, or override end NAME",
+    "edit": "override create NAME",
+    "explain": "why NAME, or schema KIND",
+    "freeze": "override create NAME --refuse-new --until 2h",
+    "history": "log",
+    "install": "demand FILE",
+    "lint": "check",
+    "list": "get KIND",
+    "logs": "why NAME, and kubectl logs",
+    "ls": "get KIND",
+    "move": "override create NAME --on NODE",
+    "pause": "suspend",
+    "pin": "override create NAME --use-version VERSION",
+    "plan": "check, or any command with --dry-run",
+    "ps": "get releases",
+    "remove": "release DEMAND|APPLICATION, or override end NAME",
+    "rm": "release DEMAND|APPLICATION, or override end NAME",
+    "rollout": "status, or rollback TIME",
+    "scale": "override create NAME --replicas N",
+    "show": "why NAME",
+    "stop": "release DEMAND|APPLICATION, or suspend",
+    "sync": "reconcile",
+    "top": "get nodes",
+    "trace": "why NAME",
+    "tree": "why NAME",
+    "uncordon": "undrain NODE",
+    "undo": "revert COMMIT, or rollback TIME",
+    "uninstall": "release DEMAND|APPLICATION",
+    "validate": "check",
 }
 
 # These commands run until they are stopped. They log or fill the screen, so they do not show the
@@ -92,15 +147,22 @@ class ExitCode(IntEnum):
 
 def load(name: str) -> click.Command:
     module = COMMANDS[name][0]
-    ros = module.split(".")[0] == "demandops_ros"
+    ros = module.startswith("demandops_ros.")
+    found = imported(name, module if ros else f"demandops.cli.{module}")
+    command: click.Command = getattr(found, name.replace("-", "_"))
+    return command
+
+
+def imported(name: str, module: str) -> ModuleType:
+    """Import a module of the command ``name``; tell what is not installed."""
     try:
-        imported = import_module(module if ros else f"demandops.cli.{module}")
-        command: click.Command = getattr(imported, name.replace("-", "_"))
+        return import_module(module)
     except ModuleNotFoundError as error:
         missing = str(error.name).split(".")[0]
         if missing in ("demandops", "demandops_ros"):
             raise
-        remedy = "see README.md, 'With ROS 2'" if ros else "install demandops again"
+        is_ros = module.startswith("demandops_ros.")
+        remedy = "see README.md, 'With ROS 2'" if is_ros else "install demandops again"
         raise click.ClickException(
             f"{name} needs {missing}, which is not installed; {remedy}"
         ) from None
@@ -110,7 +172,12 @@ def load(name: str) -> click.Command:
         raise click.ClickException(
             f"{name} needs git, which is not installed; install it (Debian: apt-get install git)"
         ) from None
-    return command
+
+
+def _hint(word: str) -> str:
+    if word in _LEADS:
+        return f"; did you mean: demandops {_LEADS[word]}"
+    return suggestion(word, [*COMMANDS, *ALIASES]).replace("; known: ", "; the commands are: ")
 
 
 class _LazyGroup(click.Group):
@@ -119,11 +186,12 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
+        args = [*ALIASES.get(args[0], args[:1]), *args[1:]]
+        if args[0] not in COMMANDS and not args[0].startswith("-"):
+            ctx.fail(f"there is no command '{args[0]}'{_hint(args[0])}")
         name, command, arguments = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
-            from demandops.repo.git import remote_repository  # noqa: PLC0415 - it imports pygit2
-
-            remote_repository.listen(show_slow)
+            child_processes.listeners[:] = [show_slow]
         return name, load(name) if name else command, arguments
 
 
@@ -138,7 +206,7 @@ def cli(verbose: bool) -> None:
     """Turn demands for applications into desired state in Git.
 
     Start with `demandops init DIR --bare`. Then run `demandops serve --state-repo DIR` to accept
-    demands over ROS 2, or `demandops request FILE --state-repo DIR` to book demands from files.
+    demands over ROS 2, or `demandops demand FILE --state-repo DIR` to book demands from files.
     """
     level = logging.INFO if verbose else logging.WARNING
     handler = logging.StreamHandler(sys.stderr)

@@ -120,7 +120,7 @@ def fitted(text: str, width: int | None) -> str:
     """Return text whose lines are wrapped between words, with a deeper indent, to fit the width."""
     lines = text.split("\n")
     for at, line in enumerate(lines):
-        if width is not None and len(line) > width:
+        if width is not None and len(line) > width and " " in line.strip():
             indent = " " * (len(line) - len(line.lstrip()) + 4)
             words = textwrap.TextWrapper(width, subsequent_indent=indent, break_on_hyphens=False)
             words.break_long_words = False

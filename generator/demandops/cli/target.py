@@ -16,12 +16,13 @@ from demandops.base.errors import InvalidInput, StateRepoError, suggestion
 from demandops.base.naming import SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.strict_yaml import located_in
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import all_keys
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, parse_file
 from demandops.repo import reader
 from demandops.repo.git.remote_repository import checkout_around, is_url, origin_of
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
-from demandops.views import release_causes
 
 # ---- contexts: the fleets that a person works with ----
 #
@@ -114,7 +115,7 @@ _VARIABLE = "DEMANDOPS_STATE_REPO"
 _NAME = "demandops.context-name"
 _CONTEXT = "demandops.context"
 _BEHIND = "demandops.checkout-behind"
-_NO_STATE_REPO = (
+NO_STATE_REPO = (
     "Which state repo? Give --state-repo, run the command in a checkout, or name a state repo "
     "once: demandops config set NAME --state-repo URL_OR_DIR"
 )
@@ -132,6 +133,8 @@ def _checkout() -> Path | None:
 
 def _default_repo(*, writes: bool = False) -> str | None:
     ctx, around, content = click.get_current_context(), _checkout(), read_contexts()
+    if ctx.params.get("via") == "ros" or ctx.params.get("hold"):
+        return None  # a demand that is sent over ROS needs no state repo
     # clusters and signing key of a context apply only to its own state repo
     context: Context | None = None
     if _NAME in ctx.meta:
@@ -185,7 +188,9 @@ _context_option = click.option(
 )
 
 
-def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Command], Command]:
+def _state_repo(
+    default: Callable[[], str | None], where: str, *, required: bool = True
+) -> Callable[[Command], Command]:
     def address(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
         from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT
         path = Path(value or "")
@@ -201,9 +206,9 @@ def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Comm
                     ctx,
                 )
             value = default()
-        if value is None:
-            raise click.UsageError(_NO_STATE_REPO, ctx)
-        return value
+        if value is None and required:
+            raise click.UsageError(NO_STATE_REPO, ctx)
+        return value or ""
 
     option = click.option(
         "--state-repo",
@@ -225,6 +230,13 @@ state_repo_option = _state_repo(_default_repo, "the checkout that you are in")
 # If the checkout has no remote, the default with `--dry-run` is the checkout itself.
 writable_repo_option = _state_repo(
     partial(_default_repo, writes=True), "the remote of the checkout that you are in"
+)
+
+# The same of a command that can also do without: then it is empty.
+optional_repo_option = _state_repo(
+    partial(_default_repo, writes=True),
+    "the remote of the checkout that you are in",
+    required=False,
 )
 
 dry_run_option = click.option(
@@ -299,7 +311,8 @@ def _names(repo: Reader, kind: str) -> Iterator[str]:
         return
     world = repo.snapshot().state
     if kind == "releases":
-        yield from (release.name for release in release_causes.releases(world))
+        running = (plan(world, key) for key in all_keys(world))
+        yield from (release.name for release in running if release)
     elif kind in ("requesters", "demands"):
         yield from world.ledger.indexed_names(kind[:-1])
     elif kind in ("applications", "connections"):

@@ -138,17 +138,14 @@ class HealthReader(ABC):
     def last_transition(self, target: Target, objects: Objects) -> str:
         """Return when the state of a release last changed; empty if the cluster does not say."""
         status = (objects.get(self.key(target)) or {}).get("status") or {}
-        state = self._service_state(status) if target.is_service else condition(status, "Available")
-        return str(state.get("lastTransitionTime", ""))
+        state = condition(status, "Ready" if target.is_service else "Available")
+        # an Application has no such condition
+        return str((state or status.get("health") or {}).get("lastTransitionTime", ""))
 
     @abstractmethod
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
     ) -> Health: ...
-
-    @abstractmethod
-    def _service_state(self, status: Object) -> Object:
-        """Return the part of a service object's status that has ``lastTransitionTime``."""
 
     @abstractmethod
     def _owns(self, target: Target, deployment: Object) -> bool: ...
@@ -302,9 +299,6 @@ class Flux(HealthReader):
             return Health("reconciled", str(ready.get("message") or "is being installed"), name)
         return worst([deployment_health(owned) for owned in self._deployments(target, objects)])
 
-    def _service_state(self, status: Object) -> Object:
-        return condition(status, "Ready")
-
     def _owns(self, target: Target, deployment: Object) -> bool:
         return (deployment["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
 
@@ -399,9 +393,6 @@ class ArgoCd(HealthReader):
             return Health("reconciled", message, name, failing=True)
         running = str(_status(item, "operationState").get("message") or "is being synced")
         return Health("reconciled", outdated or running, name)
-
-    def _service_state(self, status: Object) -> Object:
-        return status.get("health") or {}
 
     def _owns(self, target: Target, deployment: Object) -> bool:
         annotations = deployment["metadata"].get("annotations") or {}

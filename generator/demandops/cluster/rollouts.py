@@ -27,7 +27,7 @@ from demandops.cluster.object_cache import object_caches
 from demandops.decide.decision import Decision
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import affected_keys, all_keys, keys_of_claims
+from demandops.decide.planning.release_keys import affected_keys, keys_of_claims
 from demandops.decide.state import State
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.repo_settings import RepoSettings
@@ -60,12 +60,6 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
         if release is not None:
             targets.append(target_of(release, after.config.repo_settings, wanted=new is not None))
     return tuple(dict.fromkeys(targets))
-
-
-def targets_of_state(state: State) -> list[tuple[Release, Target]]:
-    planned = [release for key in all_keys(state) if (release := plan(state, key))]
-    releases = [(release, target_of(release, state.config.repo_settings)) for release in planned]
-    return sorted(releases, key=lambda pair: (pair[1].domain.cluster, pair[1].name))
 
 
 def domains_of_state(state: State) -> list[ClusterDomain]:

@@ -16,9 +16,8 @@ from demandops.base.naming import SubjectKind, TopicKey, hash_of, id_problem, to
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection, Route, RouteKey, faults
 from demandops.connections.connection_types import choose_type, type_named
-from demandops.decide.admission.admission import with_chosen_types
 from demandops.decide.planning.flows import Flow, flows, is_bridged
-from demandops.model.config.config import Config
+from demandops.model.config.config import BROKERS_FILE, Config
 from demandops.model.demand.demand import AnyDemand, Application, Connect, Demand, Item, Operation
 from demandops.model.ledger.claim import Claim, ClaimKey, demand_id
 from demandops.model.ledger.ledger import ClaimChange, Ledger, World
@@ -145,8 +144,8 @@ def with_carriers(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDema
 
     A route stays where this demand has it. Else the initial deployment may carry it, and nothing
     is booked. Else it joins the connection that has it, whichever connection the demand lists.
-    Else it is new: on the listed connection, or on a derived one. A connection stays as it is:
-    another type or broker than demanded gives a note.
+    Else it is new: on the listed connection, or on a derived one, of the first type that fits. A
+    connection stays as it is: another type or broker than demanded gives a note.
     """
     if not request.adds_claims:
         return request
@@ -165,8 +164,24 @@ def with_carriers(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDema
                 carriers.place(item, listed, index, route)
         else:
             carriers.items.append(item)
-    notes = tuple(dict.fromkeys((*request.notes, *carriers.notes)))
-    return replace(request, demanded=tuple(carriers.united()), notes=notes)
+    demanded, notes = list[Item](), dict.fromkeys((*request.notes, *carriers.notes))
+    for item in carriers.united():
+        connection = item.held
+        if isinstance(connection, Connection):
+            # that of a claimed connection stays: with a new broker or node property the choice
+            # would be another, and the request would contradict the other claims
+            kind = connection.type or choose_type(connection, config)
+            named, broker = connection.broker, ""
+            if kind and named and not id_problem(named):
+                broker = kind.broker_node(connection, config)
+            if broker not in ("", named):
+                notes[
+                    f"connection '{connection.id}' uses the broker on '{broker}', because "
+                    f"{config.place_of(BROKERS_FILE)} has none on {quoted(named)}"
+                ] = None
+            connection = replace(connection, type=kind, broker=broker or named)
+        demanded.append(replace(item, held=connection))
+    return replace(request, demanded=tuple(demanded), notes=tuple(notes))
 
 
 @dataclass(slots=True)
@@ -403,8 +418,7 @@ def with_moved_routes(world: World, claim: Claim, moved: Application) -> Ledger:
         items.append(Item(_implied(flow, connect, route), claim.requesters, is_listed=False))
     operation: Operation = "join" if claim.joined else "put"
     put = Demand(operation, claim.request, tuple(items), claim.demand)
-    put = with_chosen_types(with_carriers(put, ledger, config), config, ledger.connection)
-    for item in put.demanded:
+    for item in with_carriers(put, ledger, config).demanded:
         booked = replace(claim, held=item.held.booked())
         if current := ledger.get(booked.key):
             more = current.connection.extended(booked.connection).booked()

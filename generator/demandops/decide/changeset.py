@@ -6,27 +6,20 @@ import difflib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Any, Literal
 
 from demandops.base.errors import Fault, InvalidInput, OverLimit, Refused, fault
 from demandops.base.quoting import one_line
 from demandops.base.strict_yaml import load_all, short_repr
-from demandops.decide.booking import apply
-from demandops.decide.checks import collisions
-from demandops.decide.planning.overrides import apply_effects, effects_on
 from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys, keys_of
-from demandops.model.config.appdef import ApplicationDefinition
+from demandops.decide.planning.release_keys import ReleaseKey, all_keys, keys_of
 from demandops.model.config.config import Config
-from demandops.model.config.override import Override
 from demandops.model.config.repo_settings import ROOT_FILE
-from demandops.model.demand.demand import Application, Demand, InputTopic, Item
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
-from demandops.model.ledger.ledger import Changes, Ledger, World
-from demandops.model.release import Release, ServiceRelease
+from demandops.model.ledger.ledger import Changes, World
+from demandops.model.release import Release
 from demandops.render import gitops
 from demandops.render.gitops import path_of
 from demandops.templating.values import Evaluate
@@ -175,31 +168,6 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
         raise Refused(faults)
 
 
-def render_all(
-    world: World, evaluate: Evaluate, current: Mapping[str, str], *, keeps_late: bool
-) -> dict[str, str]:
-    """Return all generated files except those of the ledger, by path.
-
-    With ``keeps_late``, a release whose values take too long to compute keeps its file.
-    """
-    config, keys = world.config, all_keys(world)
-    files = gitops.base_files(config)
-    collisions.refuse_shared_names(world, keys)  # one would overwrite the file of the other
-    for key in keys:
-        release = plan(world, key)
-        if release is None:
-            continue
-        path = path_of(release)
-        try:
-            files[path] = gitops.release_text(release, config, evaluate, current.get(path))
-        except OverLimit:
-            if not keeps_late:
-                raise
-            if path in current:
-                files[path] = current[path]
-    return files | gitops.kept_charts(files, current, world)
-
-
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
     """Return how a release changes; ``existed`` says that it had a file before."""
     release = new or old
@@ -220,109 +188,6 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
         details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
         details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
     return ReleaseChange(release.name, release.description, path_of(release), kind, tuple(details))
-
-
-# ---- trial demands: a new configuration must render before real demands arrive ----
-
-_NEVER = datetime.fromtimestamp(0, timezone.utc)
-
-
-def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    if not config.domain_of:
-        return {}
-    plain = replace(config, overrides={})
-    return {name: list(_trial_services(appdef, plain)) for name, appdef in config.appdefs.items()}
-
-
-def _trial_services(
-    appdef: ApplicationDefinition, config: Config, version: str = ""
-) -> Iterator[ServiceRelease]:
-    services = config.services.get(appdef.name, {}).values()
-    nodes = sorted(config.domain_of)
-    # A service that runs once for a cluster has no node in other clusters. So this is the first
-    # node that can run all services, else the first of all.
-    fitting = (node for node in nodes if all(node in s.runs_at for s in services if s.nodes))
-    node = next(fitting, nodes[0])
-    inputs = {
-        role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", node),) for role in appdef.inputs
-    }
-    app = Application(f"rehearsal/{appdef.name}", appdef.name, node, inputs, version=version)
-    request = Demand("join", "rehearsal", (Item(app, ("rehearsal",)),))
-    ledger, changes = apply(Ledger(), request, _NEVER)
-    before, after = World(config, Ledger()), World(config, ledger)
-    for key in affected_keys(before, after, changes.claims):
-        release = plan(after, key)
-        if isinstance(release, ServiceRelease):
-            yield release
-
-
-def overridden_releases(
-    override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
-) -> Iterator[ServiceRelease]:
-    for release in trials:
-        # ``hold`` would keep a file that no trial has
-        effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
-        if effects and any(
-            not selector.connections and selector.takes(release.key.service, appdef)
-            for selector in override.select
-        ):
-            shaped = apply_effects(release, [(override, effects)], config)
-            if isinstance(shaped, ServiceRelease):
-                yield shaped
-
-
-def render_trial_demands(world: World, evaluate: Evaluate) -> None:
-    """Render every service of every appdef, with invented claims on a real node.
-
-    This renders each version that ``registry/versions.yaml`` lists, and each override in effect. If
-    no node is in an access domain, nothing is checked.
-
-    Raises:
-        Refused, InvalidInput: if a service cannot be planned or rendered. The error names the
-            template, the schema or the override at fault.
-        OverLimit: if nothing is known to be wrong, but some of it took too long to render.
-    """
-    config = world.config
-    trials = trial_releases(config)
-    plain = replace(config, overrides={})
-    others = (
-        release
-        for appdef, listed in (config.versions.items() if trials else ())
-        for version in listed.versions
-        if version != listed.default
-        for release in _trial_services(config.appdefs[appdef], plain, version)
-    )
-    errors = [
-        error
-        for releases in (*trials.values(), others)
-        for error in _render_errors(releases, config, evaluate)
-    ]
-    # only if all can be rendered without overrides: else a broken template would blame them
-    for override in () if errors else world.overrides:
-        overridden = [
-            list(overridden_releases(override, releases, appdef, config))
-            for appdef, releases in trials.items()
-        ]
-        failed = [_render_errors(releases, config, evaluate) for releases in overridden if releases]
-        # an override that can be rendered for one of the appdefs may be meant for that one only
-        if failed and all(failed):
-            errors += failed[0]
-    if errors:
-        only_late = all(isinstance(error, OverLimit) for error in errors)
-        faults = dict.fromkeys(fault for error in errors for fault in error.faults)
-        raise (OverLimit if only_late else InvalidInput)(faults)
-
-
-def _render_errors(
-    releases: Iterable[ServiceRelease], config: Config, evaluate: Evaluate
-) -> list[InvalidInput]:
-    errors: list[InvalidInput] = []
-    for release in releases:
-        try:
-            gitops.render(release, config, evaluate)
-        except InvalidInput as error:
-            errors.append(error)
-    return errors
 
 
 # ---- the releases and files that differ between two commits, or before and after a merge ----

@@ -27,6 +27,7 @@ from demandops.decide.admission.completing import (
 from demandops.decide.booking import Drain, Restoration, apply, restoration_faults
 from demandops.decide.changeset import Changeset, FileReader, PlannedChange, ReleaseChange
 from demandops.decide.checks import collisions, forbidden
+from demandops.decide.checks.collisions import Names
 from demandops.decide.checks.forbidden import Difference
 from demandops.decide.placement import capacity, placement, relocation
 from demandops.decide.placement.candidates import NO_ROOM
@@ -37,7 +38,7 @@ from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand
-from demandops.model.demand.goals import goal_field, read_goal
+from demandops.model.demand.goals import goal_field, read_goal, size_faults
 from demandops.model.ledger.claim import demand_id
 from demandops.model.ledger.ledger import Changes, World, claim_changes, ledger_of
 from demandops.model.ledger.records import Wait, WaitingDemand
@@ -214,7 +215,7 @@ def _searched(
     """Return what the attempt returns for the completed demand on the first nodes that do."""
     if demand.is_complete:
         return attempt(demand, ())
-    if faults := list(admission.size_faults(demand, state.config.repo_settings.limits)):
+    if faults := list(size_faults(demand, state.config.repo_settings.limits)):
         raise Refused(faults)
     checkpoint()
     request, unclear = prepared(demand, state)
@@ -244,7 +245,7 @@ def admitted(
         return request
     request, config = completed(request, state, checkpoint), state.config
     # derived connections count as well
-    if large := list(admission.size_faults(request, config.repo_settings.limits)):
+    if large := list(size_faults(request, config.repo_settings.limits)):
         raise Refused(large)
     checkpoint()
     found = [*faults, *_paced(admission.faults(request, config), checkpoint)]
@@ -302,14 +303,16 @@ class _Booked:
     planned: PlannedChange
     differing: Sequence[Difference]
     grown: Mapping[Need, int]
+    names: Names
 
 
 def _booked(
     state: State, request: Demand, now: datetime, read: FileReader, checkpoint: Checkpoint
 ) -> _Booked:
     if isinstance(request, Drain):
-        most = placement.MOST_ATTEMPTS
-        request = relocation.with_moves(request, state, state.usage(), state.names(), most)
+        request = relocation.with_moves(
+            request, state, state.usage(), state.names(), placement.MOST_ATTEMPTS
+        )
     if isinstance(request, Restoration):
         # claims of before the upgrade may carry a route twice
         united, _ = carriers.with_one_carrier(ledger_of(request.claims))
@@ -347,19 +350,23 @@ def _booked(
     changes = replace(changes, claims=claim_changes(state.ledger, ledger, [*changed, *kept_keys]))
     checkpoint()
     after = replace(state, ledger=ledger)
-    keys = affected_keys(state, after, changes.claims)
-    clashes = list(collisions.topic_faults(request, state, after, _paced(keys, checkpoint)))
-    clashes += collisions.name_faults(
-        request, state, after, _paced(keys, checkpoint), changes, state.names()
-    )
-    for change in changes.claims if isinstance(request, Restoration) else ():
-        clashes += collisions.faults_of_claim(change.after, state, after) if change.after else ()
+    # a service whose node is to be chosen later has no release yet
+    affected = affected_keys(state, after, changes.claims)
+    keys = [key for key in affected if isinstance(key, ClientKey) or key.node]
+    names = collisions.followed(state.names(), state, after, keys)
+    clashes = [
+        *collisions.topic_faults(request, state, after, _paced(keys, checkpoint), names),
+        *collisions.name_faults(
+            request, state, after, _paced(keys, checkpoint), changes, state.names()
+        ),
+    ]
+    claims = filter(None, (change.after for change in changes.claims))
+    for claim in claims if isinstance(request, Restoration) else ():
+        clashes += collisions.faults_of_claim(claim, state, after, names)
     clashes = clashes or list(collisions.faults_in_files(request, changes, read))
     if clashes:
         raise Refused(clashes)
-    # a service whose node is to be chosen later has no release yet
-    chosen = [key for key in keys if isinstance(key, ClientKey) or key.node]
-    planned = changeset.plan_change(state, after, changes, chosen, read, state.plans, checkpoint)
+    planned = changeset.plan_change(state, after, changes, keys, read, state.plans, checkpoint)
     differing = [*forbidden.differences(request, state, after, changes.claims, planned.plans)]
     if refused := [difference.fault for difference in differing if difference.is_refused]:
         raise Refused(refused)
@@ -367,7 +374,7 @@ def _booked(
     # a drain was tried on its nodes already, and what releases claims makes room
     if request.adds_claims or isinstance(request, Restoration):
         capacity.refuse_excess(state.usage(), grown, state.config)
-    return _Booked(request, after, changes, planned, differing, grown)
+    return _Booked(request, after, changes, planned, differing, grown, names)
 
 
 # ---- render ----
@@ -385,7 +392,7 @@ def _rendered(state: State, booked: _Booked, read: FileReader, checkpoint: Check
     )
     checkpoint()
     usage = state.usage().plus(booked.grown)
-    after = state.followed_by(booked.after.ledger, booked.planned, usage)
+    after = state.followed_by(booked.after.ledger, booked.planned, usage, booked.names)
     checkpoint()
     claims = [(change.before, change.after) for change in changes.claims]
     required_by, approved_by = permission.approval(request, claims, config)
@@ -428,7 +435,7 @@ def _once(*texts: str) -> tuple[str, ...]:
 
 
 def notes_on(
-    request: Demand, before: World, after: World, changes: Changes, rendered: Changeset
+    request: Demand, before: World, after: State, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
     for app in request.applications:
         if app.separate:

@@ -68,7 +68,7 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
         )
         for each in malformed or allowed:
             yield each.within(claim_files.path_of(claim.key))
-        yield from collisions.faults_of_claim(claim, before, after)
+        yield from collisions.faults_of_claim(claim, before, after, after.names())
         keys, changed = keys_of_claims(after, [claim]), Changes((change,))
         faults = list(collisions.name_faults(wanted, before, after, keys, changed, after.names()))
         without = replace(after, ledger=after.ledger.replace(change.key, change.before))

@@ -18,13 +18,14 @@ from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, needed_access
 from demandops.decide.booking import Drain
-from demandops.decide.checks.collisions import all_names, publishers
+from demandops.decide.checks.collisions import Names, publishers, topics_made
 from demandops.decide.placement.candidates import lacks, requirement_of, unmet
-from demandops.decide.placement.capacity import overcommitted, whole_usage
+from demandops.decide.placement.capacity import overcommitted
 from demandops.decide.placement.relocation import following_overrides, with_moves
 from demandops.decide.planning.flows import flows_without_carrier, topics_of_origin
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.release_keys import claims_needing
+from demandops.decide.state import State
 from demandops.model.config.appdef import ignored_fields
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.override import Override
@@ -57,25 +58,25 @@ class MissingInput:
         return fault(f"application '{self.application}'", self.reason).within(self.file)
 
 
-def missing_inputs(world: World) -> list[MissingInput]:
+def missing_inputs(state: State) -> list[MissingInput]:
     # Suspended claims need no topics, and suspended connections carry none.
-    active = without_suspended(world)
+    active = without_suspended(state)
     missing = {
         MissingInput(claim.application.id, claim_files.path_of(claim.key), reason)
         for claim in active.ledger
         if claim.is_on_application
-        for reason in _reasons(claim.application, active)
+        for reason in _reasons(claim.application, active, state.names())
     }
     return sorted(missing, key=lambda each: (each.application, each.reason, each.file))
 
 
-def _reasons(app: Application, active: World) -> Iterator[str]:
+def _reasons(app: Application, active: World, names: Names) -> Iterator[str]:
     config = active.config
     for role, topic in app.all_inputs():
         if topic.source not in config.nodes:
             where = f"'{topic.source}' is not in the inventory"
             yield f"{role} {topic.topic} does not arrive: {where}"
-        elif topic.application and not any(publishers(active, topic.source, topic.topic)):
+        elif topic.application and not any(publishers(names, active, topic.source, topic.topic)):
             maker = f"application '{topic.application}' of '{topic.source}'"
             yield f"{role} {topic.topic} does not arrive: {maker} does not make it"
     for flow in flows_without_carrier(config, app, active.ledger):
@@ -99,37 +100,36 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
 # The demand of such a reader does not hold the application, and is not asked when it ends.
 
 
-def unheld_output_warnings(world: World) -> Iterator[Fault]:
-    for claim in sorted(world.ledger, key=lambda claim: claim_files.path_of(claim.key)):
-        for note in unheld_outputs(claim.held, claim.demand, world):
+def unheld_output_warnings(state: State) -> Iterator[Fault]:
+    for claim in sorted(state.ledger, key=lambda claim: claim_files.path_of(claim.key)):
+        for note in unheld_outputs(claim.held, claim.demand, state):
             yield fault("", note).within(claim_files.path_of(claim.key))
 
 
-def unheld_outputs(held: Held, demand: str, world: World) -> Iterator[str]:
+def unheld_outputs(held: Held, demand: str, state: State) -> Iterator[str]:
     if not isinstance(held, Application) or held.held_for:
         return
-    services = (each for services in world.config.services.values() for each in services.values())
-    patterns = {re.escape(each) for service in services for each in service.outputs.values()}
-    could_be_output = re.compile("|".join(patterns).replace(r"\{instance\}", ".+")).fullmatch
     told = set[tuple[str, str]]()
     for _, input in held.all_inputs():
-        if input.application or not could_be_output(input.topic):
+        key = next(publishers(state.names(), state, input.source, input.topic), None)
+        if input.application or key is None:
             continue
-        for key, output in publishers(world, input.source, input.topic):
-            claims = claims_needing(world, key)
-            maker = claims[0].subject.id
-            # a service may make thousands of topics, which are told once
-            if any(claim.demand == demand for claim in claims) or (maker, output) in told:
-                continue
-            told.add((maker, output))
+        claims = claims_needing(state, key)
+        maker = claims[0].application
+        service = state.config.services[maker.appdef][key.service]
+        made = topics_made(state, service, key)
+        output = f"{key.service}.{next(name for name in made if made[name] == input.topic)}"
+        # a service may make thousands of topics, which are told once
+        if not any(claim.demand == demand for claim in claims) and (maker.id, output) not in told:
+            told.add((maker.id, output))
             yield (
                 f"application '{held.id}': {input.topic} of '{input.source}' is an output of "
-                f"application '{maker}', which may end before this demand; a Demand that names "
-                f"{{application: {maker}, output: {output}}} instead of the topic holds it"
+                f"application '{maker.id}', which may end before this demand; a Demand that names "
+                f"{{application: {maker.id}, output: {output}}} instead of the topic holds it"
             )
 
 
-def lost_output_notes(changes: Changes, after: World) -> Iterator[str]:
+def lost_output_notes(changes: Changes, after: State) -> Iterator[str]:
     """Yield who still reads the outputs that are no longer made after these changes."""
     for change in changes.claims:
         if change.before is None or not change.before.is_on_application or change.only_renews:
@@ -142,7 +142,7 @@ def lost_output_notes(changes: Changes, after: World) -> Iterator[str]:
             for made in topics_of_origin(after.config, app, output):
                 place = made.node, made.topic.topic
                 reading = [claim.key for claim in after.ledger.each_with("takes", *place)]
-                if reading and not any(publishers(after, *place)):
+                if reading and not any(publishers(after.names(), after, *place)):
                     what = f"{made.topic.topic} of '{made.node}' ({output})"
                     lost = dict.fromkeys(reading, what) | lost
         for key in sorted(lost, key=str):
@@ -369,11 +369,11 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
 _MOST_NODES = 3
 
 
-def policy_warnings(world: World) -> Iterator[Fault]:
+def policy_warnings(world: State) -> Iterator[Fault]:
     config = world.config
     yield from _open_by_host_network(config)
     yield from _connections_no_longer_allowed(world)
-    for node, excess in overcommitted(world, whole_usage(world)):
+    for node, excess in overcommitted(world, world.usage()):
         message = (
             f"{excess}; these services stay on the node, but no demand gets more of this resource "
             "there; raise the capacity, or move something to another node"
@@ -382,7 +382,7 @@ def policy_warnings(world: World) -> Iterator[Fault]:
         yield fault("", f"'{node.id}': {message}").within(file)
     for id in config.drained_nodes:
         if world.ledger.applications_on.get(id):
-            drain = with_moves(Drain(id=id), world, whole_usage(world), all_names(world))
+            drain = with_moves(Drain(id=id), world, world.usage(), world.names())
             file = config.file_of(NODES_FILE, config.host_of(id))
             for text in (*drain.moved, *drain.stays):
                 yield fault("", f"'{id}' is drained: {text}").within(file)

@@ -57,6 +57,8 @@ class Forge(ABC):
     HEADERS: ClassVar[dict[str, str]]
     # The last part of the path of a commit's pull requests
     OF_COMMIT: ClassVar[str]
+    # The field of a pull request that says whether it is merged
+    MERGED: ClassVar[str]
     # The HTTP status with which the forge refuses a second pull request for a branch
     EXISTS: ClassVar[int]
 
@@ -70,10 +72,6 @@ class Forge(ABC):
     @abstractmethod
     def find(self, branch: str, target: str) -> PullRequest | None:
         """Return the pull request from a branch to ``target``, open or not, or None."""
-
-    @abstractmethod
-    def _is_merged(self, data: Any) -> bool:  # noqa: ANN401 - any JSON
-        """Raise KeyError or TypeError if ``data`` is not the forge's JSON about a pull request."""
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
         """Return the pull request from a branch to ``target``; create it if there never was one.
@@ -141,7 +139,7 @@ class Forge(ABC):
     def _read(self, data: Any) -> PullRequest:  # noqa: ANN401
         try:
             # a merged pull request has the state "closed" too
-            closed: PullRequestState = "merged" if self._is_merged(data) else "closed"
+            closed: PullRequestState = "merged" if data[self.MERGED] else "closed"
             state = "open" if closed == "closed" and data["state"] == "open" else closed
             link = str(data["html_url"])
             if not link.isprintable():
@@ -163,6 +161,7 @@ class GitHub(Forge):
         "X-GitHub-Api-Version": "2022-11-28",
     }
     OF_COMMIT = "pulls"
+    MERGED = "merged_at"
     EXISTS = 422
 
     def find(self, branch: str, target: str) -> PullRequest | None:
@@ -177,9 +176,6 @@ class GitHub(Forge):
         answer = self._call("GET", f"{self._pulls}?{urlencode(query)}")
         return self._read(answer[0]) if isinstance(answer, list) and answer else None
 
-    def _is_merged(self, data: Any) -> bool:  # noqa: ANN401
-        return data["merged_at"] is not None
-
 
 class Gitea(Forge):
     """Gitea or Forgejo, by the API v1 that ``/api/swagger`` of each instance describes."""
@@ -187,6 +183,7 @@ class Gitea(Forge):
     NAME = "Gitea"
     HEADERS = {"Accept": "application/json", "Authorization": "token {token}"}  # noqa: RUF012
     OF_COMMIT = "pull"
+    MERGED = "merged"
     EXISTS = 409
 
     def find(self, branch: str, target: str) -> PullRequest | None:
@@ -197,9 +194,6 @@ class Gitea(Forge):
             if error.status == 404:  # or the token may not see the project
                 return None
             raise
-
-    def _is_merged(self, data: Any) -> bool:  # noqa: ANN401
-        return bool(data["merged"])
 
 
 def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -23,7 +24,6 @@ from demandops.model.config.base_model import seconds_of
 from demandops.model.config.config import Config
 from demandops.model.config.repo_settings import ROOT_FILE, Limits
 from demandops.model.demand.demand import Demand
-from demandops.model.demand.goals import length_faults
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.ledger.records import in_turn
@@ -409,13 +409,13 @@ class Backoff:
 
 # ---- the budget of one decision, because other demands wait meanwhile ----
 
-# The usual demand lists a dozen topics; one of this size is decided in some 10 ms.
-_USUAL = Limits.model_validate({"demandItems": 200, "demandCharacters": 20_000})
+# The usual demand lists a dozen topics; one of so many characters is decided in some 10 ms.
+_USUAL = 20_000
 
 
 def may_take_long(demand: Demand) -> bool:
     # what was decided before such a demand is published first
-    return any(True for _ in length_faults(demand.goal, _USUAL))
+    return len(json.dumps(demand.goal)) > _USUAL
 
 
 def within(limits: Limits, runtime: Runtime) -> Checkpoint:

@@ -72,9 +72,7 @@ class Generator:
                 self._journal = open_journal(self._slot.folder)
             except OSError as error:
                 raise access_error(error, f"the data folder of {state_repo}") from None
-            repository = connect(
-                state_repo, self._slot.folder, log.info, allow_offline=start_offline
-            )
+            repository = connect(state_repo, self._slot.folder, allow_offline=start_offline)
             repository.signer, repository.runtime = signer, runtime
 
             def start() -> Snapshot:

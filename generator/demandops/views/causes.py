@@ -16,8 +16,7 @@ from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_message import GENERATOR_NAME
-from demandops.views import release_causes
-from demandops.views.source import Source, since_of, word_of
+from demandops.views.source import Source, claims_behind, since_of, word_of
 
 Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
 
@@ -46,8 +45,7 @@ class Cause:
     command: str = ""
     since: datetime | None = None
     told: str = ""  # details, such as a cluster's message, or a person's reason
-    # What ``what`` names, if people can look at it by itself.
-    names: Literal["", "release", "releases", "override", "proposal", "demand"] = ""
+    thing: tuple[str, str] = ("", "")  # that ``what`` names, if one does: its kind and name
     cluster: str = ""  # of the releases
     releases: tuple[str, ...] = ()  # empty if the cause is not found by release
     applications: tuple[str, ...] = ()
@@ -130,19 +128,20 @@ def _denied(source: Source) -> Iterator[Cause]:
     for override, claims in by_override.values():
         what = " and ".join(dict.fromkeys(claim.subject.id for claim in claims))
         applications = _applications_with(source, claims)
-        yield _denial(source, override, "override", what, "is booked", claims, applications)
+        thing = "override", override.name
+        yield _denial(source, override, thing, what, "is booked", claims, applications)
     # the claims that need a denied release are not suspended as a whole
     for release, override in source.denied:
-        claims = release_causes.claims_behind(source.active.ledger, release)
+        claims = claims_behind(source.active.ledger, release)
         served = release.applications if isinstance(release, ServiceRelease) else ()
-        what = release.description
-        yield _denial(source, override, "release", what, "is needed", claims, served, release.name)
+        what, thing = release.description, ("release", release.name)
+        yield _denial(source, override, thing, what, "is needed", claims, served, release.name)
 
 
 def _denial(
     source: Source,
     override: Override,
-    names: Literal["override", "release"],
+    thing: tuple[str, str],
     what: str,
     state: str,
     claims: Sequence[Claim],
@@ -160,7 +159,7 @@ def _denial(
         shlex.join(["git", "rm", override.path]),
         change.time if change else None,
         told=override.reason,
-        names=names,
+        thing=thing,
         releases=releases,
         applications=tuple(dict.fromkeys(applications)),
         requesters=requesters_of(claims),
@@ -216,7 +215,7 @@ def _not_ready(source: Source) -> Iterator[Cause]:
             members[0][1],
             min(filter(None, (since_of(source.status(name)) for name in names)), default=None),
             told=f"{object}: {reason}" if object else reason,
-            names="releases" if several else "release",
+            thing=("", "") if several else ("release", names[0]),
             cluster=cluster,
             releases=tuple(names),
             applications=tuple(applications),
@@ -288,7 +287,7 @@ def _awaited(source: Source) -> Iterator[Cause]:
             "the generator, as soon as a node has room; the nodes' operator can add room, or a "
             "requester can release something",
             since=waiting.since,
-            names="demand",
+            thing=("demand", waiting.demand),
             requesters=waiting.requesters,
             demands=(waiting.demand,),
         )
@@ -301,7 +300,7 @@ def _awaited(source: Source) -> Iterator[Cause]:
             "merge the branch to approve the demand, or delete the branch to refuse it",
             shlex.join(["demandops", "approve", proposal.branch, "--commit", proposal.commit]),
             proposal.since,
-            names="proposal",
+            thing=("proposal", proposal.branch),
             requesters=proposal.requesters,
             demands=proposal.demands,
         )

@@ -22,6 +22,7 @@ from demandops.model.config.config import DOMAINS_FILE
 from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
+from demandops.repo.history.commit_log import LogEntry
 from demandops.views import vocabulary
 from demandops.views.rows import Column, Row, labels_of
 from demandops.views.source import Source, since_of, word_of, worst_word
@@ -591,9 +592,20 @@ def _proposals(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 def _events(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     for entry in islice(source.reader().log(source.commit), MOST_COMMITS):
-        data = vocabulary.commit_data(entry)
-        who = ", ".join(data["requesters"]) or data["author"]
-        yield entry.commit, ({"name": entry.commit, **data, "who": who},)
+        yield entry.commit, (event(entry),)
+
+
+def event(entry: LogEntry) -> Json:
+    data = vocabulary.commit_data(entry)
+    who = ", ".join(data["requesters"]) or data["author"]
+    if data["operation"] in ("rollback", "reject"):  # a person did it to what others hold
+        who = f"{data['author']}, for {', '.join(data['requesters'])}"
+    return {"name": entry.commit, **data, "who": who}
+
+
+def _told(commit: Json, now: datetime) -> str:
+    decision = commit["decision"]
+    return f"{commit['summary']}{f'; {vocabulary.decision_text(decision)}' if decision else ''}"
 
 
 _RELEASE = Column("name", "Release", links="release")
@@ -911,11 +923,12 @@ KINDS: dict[str, Kind] = {
             "The newest commits, by demands, people and the generator.",
             (
                 Column("time", "When", 0, "time"),
-                Column("operation", "Operation", 3),
-                Column("who", "Who", 1),
-                Column("summary", "What", 2),
-                Column("commit", "Commit", 4, texts_of=lambda item, now: item["commit"][:10]),
-                Column("why", "Why", 9, only_wide=True),
+                Column("commit", "Commit", 0, texts_of=lambda item, now: item["commit"][:10]),
+                Column("summary", "What", 1, texts_of=_told),
+                Column("who", "Who", 2),
+                Column("operation", "Operation", 3, only_wide=True),
+                Column("author", "Author", 3, only_wide=True),
+                Column("request", "Request", 9, only_wide=True),
             ),
             _events,
         ),

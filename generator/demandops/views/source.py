@@ -33,18 +33,17 @@ from demandops.decide.override_report import Entry, override_report, override_st
 from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import denied_release, plan
-from demandops.decide.planning.release_keys import ReleaseKey
+from demandops.decide.planning.release_keys import ReleaseKey, takes
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override
 from demandops.model.ledger.claim import Claim
-from demandops.model.ledger.ledger import World, changes_on
-from demandops.model.release import Release, ServiceRelease
+from demandops.model.ledger.ledger import Ledger, World, changes_on
+from demandops.model.release import Release, ServiceRelease, claims_of
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.snapshot import Problem, Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
-from demandops.views import release_causes
 
 # ---- the health of a release in one word ----
 
@@ -93,6 +92,21 @@ class Planned:
     release: Release
     target: Target  # the Kubernetes object whose health counts as the release's
     claims: list[Claim]  # that need the release
+
+
+def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
+    # callers pass a ledger without suspended claims
+    return by_booking(claim for claim in claims_of(release, ledger) if needs(claim, release))
+
+
+def by_booking(claims: Iterable[Claim]) -> list[Claim]:
+    return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
+
+
+def needs(claim: Claim, release: Release) -> bool:
+    if not isinstance(release, ServiceRelease):
+        return True
+    return takes(claim.application, release.service, release.key)
 
 
 class _Derived(Generic[_Value]):
@@ -196,9 +210,9 @@ class Source:
                 continue
             kept = [claim for claim in planned.claims if id(claim) not in gone]
             added = [claim for id in ids for claim in fresh[kind].get(id, ())]
-            needing = [claim for claim in added if release_causes.needs(claim, release)]
+            needing = [claim for claim in added if needs(claim, release)]
             if needing or len(kept) < len(planned.claims):
-                yield key, replace(planned, claims=release_causes.by_booking([*kept, *needing]))
+                yield key, replace(planned, claims=by_booking([*kept, *needing]))
 
     @property
     def commit(self) -> str:
@@ -226,7 +240,7 @@ class Source:
         if (release := plan(self.state, key)) is None:
             return None
         target = rollouts.target_of(release, self.config.repo_settings)
-        return Planned(release, target, release_causes.claims_behind(self.active.ledger, release))
+        return Planned(release, target, claims_behind(self.active.ledger, release))
 
     @_Derived
     def planned(self) -> dict[ReleaseKey, Planned | None]:

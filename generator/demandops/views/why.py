@@ -25,9 +25,11 @@ from demandops.decide.decision import Decision, decide
 from demandops.decide.override_report import affected_releases
 from demandops.decide.planning.overrides import suspended_by
 from demandops.decide.warnings import missing_inputs
-from demandops.model.config.config import DOMAINS_FILE, NODES_FILE
+from demandops.model.config.config import DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
+from demandops.model.config.override import OVERRIDES_ROOT
+from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import Claim, requesters_of
+from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import waiting_path
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import domain_folder, path_of
@@ -36,10 +38,8 @@ from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.repo.load import ledger_files
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
-from demandops.views import release_causes
-from demandops.views.kinds import nodes_of
-from demandops.views.release_causes import by_booking
-from demandops.views.source import Source, since_of, word_of
+from demandops.views.kinds import effect_texts, nodes_of
+from demandops.views.source import Source, by_booking, since_of, word_of
 from demandops.views.vocabulary import (
     Json,
     claim_data,
@@ -273,7 +273,7 @@ def _release(source: Source, thing: Thing) -> Json:
             "health_since": time_data(since_of(status)) if status else None,
             "shaped_by": [
                 {"file": file, "entry": entry or None, "what": what}
-                for file, entry, what in release_causes.shaping_files(release, source.config)
+                for file, entry, what in shaping_files(release, source.config)
             ],
             "overrides": [override_data(*each) for each in release.shaping.by],
         }
@@ -282,6 +282,24 @@ def _release(source: Source, thing: Thing) -> Json:
             denied = override_data(override, ("deny",))
             return {"state": "denied", **place_data(release), "denied_by": denied}
     return {"state": "gone"}
+
+
+def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
+    # (file, entry, what it decides) for all that shapes a release but overrides
+    images = {name: config.images[name] for name in release.images if name in config.images}
+    if isinstance(release, ServiceRelease):
+        images = {name: release.version.image(name, image) for name, image in images.items()}
+    node, domain, file_of = release.node, release.domain, config.file_of
+    return [
+        (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
+        *release.shaping_entries(config),
+        *(
+            (file_of(IMAGES_FILE, name), f"images.{name}", image.reference())
+            for name, image in images.items()
+        ),
+        (file_of(NODES_FILE, node.id), node.id, f"in cluster {node.cluster}"),
+        (file_of(DOMAINS_FILE, domain.name), domain.name, f"namespace {domain.namespace}"),
+    ]
 
 
 def _subject(source: Source, thing: Thing) -> Json:
@@ -353,18 +371,6 @@ def _override(source: Source, thing: Thing) -> Json:
     held = _held(source, [*entry.claims], affected_releases(entry, source.state))
     what = f"{', '.join(effect_texts(data))}, of {data['owner']}: {data['reason']}"
     return {**held, "state": entry.state, "what": what}
-
-
-def effect_texts(override: Json) -> list[str]:
-    shown, listed = ("version", "replicas", "node"), ("images", "values")
-    return [
-        f"{name} {value}"
-        if name in shown
-        else f"{name} {', '.join(value)}"
-        if name in listed
-        else name
-        for name, value in override["effects"].items()
-    ]
 
 
 def _proposal(source: Source, thing: Thing) -> Json:
@@ -445,7 +451,7 @@ def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | Non
         rows.append(
             claim_data(claim)
             | {
-                "release_by": release_causes.how_to_release(claim),
+                "release_by": _how_to_release(claim),
                 "overdue": claim.lease is not None and claim.lease.has_ended(source.now),
                 "kept_by": override_data(kept, ("keep",)) if kept else None,
                 "suspended_by": override_data(denying, ("deny",)) if denying else None,
@@ -459,10 +465,24 @@ def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | Non
         by_name = {release.name: release for release in releases}
         data["releases"] = [
             release_data(release)
-            | {"health": word_of(source.status(name)) if source.statuses else None}
+            | ({"health": word_of(source.status(name))} if source.statuses else {})
             for name, release in sorted(by_name.items())
         ]
     return data
+
+
+def _how_to_release(claim: Claim) -> str:
+    if claim.keeping_override is not None:
+        return f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
+    if is_released_by_demand_id(claim):
+        return f"send 'operation: release' for demand '{claim.demand}'"
+    return f"send request '{claim.request}' again with shutdown: true"
+
+
+def is_released_by_demand_id(claim: Claim) -> bool:
+    # A goal of the reference's action has no demand id. The generator derives it from the request.
+    is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
+    return claim.keeping_override is None and not is_of_a_request
 
 
 # ---- the past ----

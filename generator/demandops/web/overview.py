@@ -96,18 +96,12 @@ def newest(events: Sequence[Event]) -> Iterator[tuple[Event, int]]:
         yield group[0], len(group)
 
 
-# The link to what a cause names.
 def link_of(cause: Cause) -> Part:
+    kind, name = cause.thing
+    if kind:
+        return Part(cause.what, "thing", {"kind": kind, "name": name})
     query = f"{exactly('cluster', cause.cluster)} {exactly('health', cause.kind)}"
-    view, params = {
-        "release": ("release", {"name": "".join(cause.releases[:1])}),
-        "releases": ("services", {"q": query}),
-        "demand": ("demands", {"q": exactly("demand", cause.what)}),
-        "override": ("overrides", {}),
-        "proposal": ("proposals", {}),
-        "": ("", {}),
-    }[cause.names]
-    return Part(cause.what, view, params)
+    return Part(cause.what, "services", {"q": query}) if cause.releases else Part(cause.what)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from urllib.parse import urlencode
 import anyio
 from anyio import to_thread
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from starlette.applications import Starlette
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
@@ -256,6 +256,8 @@ class Site:
             "moment": parse_time,
             "decision": decision_text,
             "sh": shlex.quote,
+            # a line may end behind a slash of an id or a topic, and in no word
+            "name": lambda text: escape(lines(str(text))).replace("/", Markup("/<wbr>")),
         }
         self.application = Starlette(
             routes=[

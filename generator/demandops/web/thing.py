@@ -8,13 +8,13 @@ from typing import Any
 from demandops.base import strict_yaml
 from demandops.model.config.base_model import parse_time
 from demandops.model.release import ServiceRelease
-from demandops.views.release_causes import is_released_by_demand_id
 from demandops.views.source import WORDS, HealthChange, Source
 from demandops.views.vocabulary import Json
 from demandops.views.why import (
     commits_of,
     explain,
     find,
+    is_released_by_demand_id,
     last_difference,
     release_of,
     stopped_with,
@@ -22,8 +22,11 @@ from demandops.views.why import (
 
 _TONES = WORDS | {
     **dict.fromkeys(("runs", "held", "used", "in force", "approved", "exists"), "good"),
+    "kept": "none",
     **dict.fromkeys(("denied", "suspended", "rejected"), "bad"),
-    **dict.fromkeys(("waiting", "proposed", "partly suspended", "not rendered yet"), "busy"),
+    **dict.fromkeys(
+        ("waiting", "proposed", "overdue", "partly suspended", "not rendered yet"), "busy"
+    ),
 }
 _MOST_COMMITS = 20
 

@@ -339,7 +339,7 @@ def test_what_cannot_be_read_or_used_is_no_fault_of_the_program(
 
 
 def test_a_full_disk_of_the_clone_is_told_at_a_push(url: str, bare: Path, tmp_path: Path) -> None:
-    repository = RemoteRepository(url, tmp_path / "clone.git", print, allow_offline=False)
+    repository = RemoteRepository(url, tmp_path / "clone.git")
     before = repository.tip()
     tree, who = repository.objects[before].peel(pygit2.Tree).id, generator_signature(NOW)
     commit = repository.new.add_commit(None, (who, who), "Again\n", tree, [before])
@@ -348,7 +348,7 @@ def test_a_full_disk_of_the_clone_is_told_at_a_push(url: str, bare: Path, tmp_pa
 
 
 def test_a_remote_that_does_not_answer_is_told(url: str, tmp_path: Path) -> None:
-    repository = RemoteRepository(url, tmp_path / "clone.git", print, allow_offline=False)
+    repository = RemoteRepository(url, tmp_path / "clone.git")
     with socket.create_server(("127.0.0.1", 0)) as silent:
         place = f"git://127.0.0.1:{silent.getsockname()[1]}/state.git"
         result = repository._run_git("ls-remote", place, timeout=0.2)

@@ -243,10 +243,9 @@ def test_a_rollout_target_names_its_argo_cd_application_or_none_for_flux(
 ) -> None:
     state, files = start(case)
     goal = strict_yaml.load(requests_of(case)[0].read_text())
-    found = rollouts.targets_of_state(decide(state, goal, NOW, files.get).state)
-    assert {target.name for release, target in found} == {release.name for release, _ in found}
-    assert {target.domain.application for _, target in found} == {application}
-    assert {target.is_service for _, target in found} == {True, False}
+    found = rollouts.targets_of_decision(state, decide(state, goal, NOW, files.get))
+    assert {target.domain.application for target in found} == {application}
+    assert {target.is_service for target in found} == {True, False}
 
 
 def test_a_demand_waits_for_no_release_that_only_others_need() -> None:

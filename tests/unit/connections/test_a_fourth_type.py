@@ -27,10 +27,13 @@ from demandops.connections.connection import (
     ConnectionType,
 )
 from demandops.decide.decision import Decision
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import keys_of
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.ledger import claim as claim_files
 from demandops.templating import engine
-from demandops.views import release_causes
+from demandops.views.source import claims_behind
+from demandops.views.why import shaping_files
 
 from tests.kit.connections import ROS_IMAGE, demand, routes, state
 from tests.kit.goals import connection, goal
@@ -145,9 +148,9 @@ def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
     world, _ = booked()
     ledger = world.state.ledger
     subject = Subject(SubjectKind.CONNECTION, "c")
-    (release,) = release_causes.releases(world.state, subject)
-    assert release_causes.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
-    files = [each[:2] for each in release_causes.shaping_files(release, world.config)]
+    (release,) = (plan(world.state, key) for key in keys_of(world.state, subject))
+    assert claims_behind(ledger, release) == [*ledger.claims_on(subject)]
+    files = [each[:2] for each in shaping_files(release, world.config)]
     assert ("inventory/nodes.yaml", "edge.wan") in files
     assert ("registry/images.yaml", "images.relay") in files
 

@@ -7,8 +7,8 @@ from json import dumps
 from typing import Any
 
 import pytest
-from demandops.decide.changeset import trial_releases
 from demandops.decide.planning.overrides import apply_effects, effects_on
+from demandops.decide.state import trial_releases
 from demandops.decide.warnings import tied_override_warnings
 from demandops.model.config.override import Override, OverrideFile
 from demandops.model.release import ServiceRelease

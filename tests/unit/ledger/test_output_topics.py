@@ -121,14 +121,3 @@ def test_an_upgrade_takes_the_oldest_cloud_for_the_usual_one() -> None:
     apps = (claim.application for claim in marked if claim.is_on_application)
     inputs = [topic for app in apps for topic in app.inputs["point_cloud"]]
     assert {topic.topic: topic.further for topic in inputs} == {FRONT[0]: False, REAR[0]: True}
-
-
-def test_a_topic_in_another_role_hides_no_usual_topic() -> None:
-    repo = MemoryRepo()
-    ego = ("/odd/ego", "vehicle01")
-    repo.send(goal([application("edge/a", who=["v"], ego=[ego], clouds=[])], id="a"))
-    repo.send(goal([application("edge/b", who=["v"], clouds=[FRONT])], id="b"))
-    usual = repo.state.ledger.usual_topics
-    assert [*usual("ego_data", "vehicle01", excluded=FRONT[0])] == ["/odd/ego"]
-    assert [*usual("ego_data", "vehicle01", excluded="/odd/ego")] == []
-    assert [*usual("point_cloud", "vehicle01", excluded="")] == [FRONT[0]]

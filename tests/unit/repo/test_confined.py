@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from demandops.decide.changeset import trial_releases
+from demandops.decide.state import trial_releases
 from demandops.repo.merge_check import confined_process
 from demandops.repo.merge_check import rendered_charts as helm_runs
 from demandops.repo.merge_check.rendered_charts import (

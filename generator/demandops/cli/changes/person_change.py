@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, fields
 from functools import wraps
 from pathlib import Path
@@ -18,17 +18,24 @@ from typing import Any
 import click
 
 from demandops.base import settings
+from demandops.base.errors import InvalidInput
 from demandops.base.quoting import harmless, one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import json_output, target
 from demandops.cli.output import done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.diff import release_lines
-from demandops.decide.changeset import ReleaseChange, describe_change, planned_releases
+from demandops.decide.changeset import (
+    FileChange,
+    ReleaseChange,
+    describe_change,
+    planned_releases,
+)
 from demandops.decide.planning.overrides import suspended_claims
 from demandops.decide.state import State
 from demandops.model.ledger.claim import requesters_of
-from demandops.model.release import claims_of
+from demandops.model.release import Release, claims_of
+from demandops.render import gitops
 from demandops.repo import reader
 from demandops.repo.forge import ForgeError, forge_for
 from demandops.repo.git.signing import Signer
@@ -128,8 +135,7 @@ def consequence(
     ``claims`` are those that are released or reduced, ``who`` are their requesters, or those of the
     releases that stop.
     """
-    for line in release_lines([*releases][:_MOST_SHOWN]):
-        yield fitted(f"  {line}", terminal_width())
+    yield from (f"  {line}" for line in release_lines([*releases][:_MOST_SHOWN]))
     if len(releases) > _MOST_SHOWN:
         yield f"  and {count(len(releases) - _MOST_SHOWN, 'more release')} (-o json lists all)"
     stopped = sum(release.change == "stop" for release in releases)
@@ -152,6 +158,12 @@ def warned_if_unnamed(person: Person) -> Person:
 
 
 # ---- a commit of a person ----
+
+
+def _text(release: Release | None, state: State) -> object:
+    with suppress(InvalidInput):
+        return release and gitops.render(release, state.config, state.evaluate)
+    return None
 
 
 @contextmanager
@@ -180,11 +192,15 @@ def commit(
         before = repo.snapshot(progress=report)
         after = person_commit.state_after(repo.repository, before, files)
     old, new = planned_releases(before.state), planned_releases(after)
-    changes = [
-        describe_change(old.get(key), new.get(key), key in old)
-        for key in {**old, **new}
-        if old.get(key) != new.get(key)
-    ]
+    changes = []
+    for key in {**old, **new}:
+        was, now = old.get(key), new.get(key)
+        change = describe_change(was, now, key in old)
+        # a release also has what no file shows, such as whether its node is drained
+        if change.change != "change" or (
+            was != now and (change.details or _text(was, before.state) != _text(now, after))
+        ):
+            changes.append(change)
     changes.sort(key=lambda change: (change.change, change.name))
     stopped = [release for key, release in old.items() if key not in new]
     who = {name for r in stopped for name in requesters_of(claims_of(r, before.state.ledger))}
@@ -192,6 +208,7 @@ def commit(
     claims = [claim for claim, _ in suspended_claims(after) if claim.key not in suspended]
     of_command, lines = more(before.state, after)
     told = [f"{summary} ({', '.join(files)})", *lines, *consequence(changes, who)]
+    told = [fitted(line, terminal_width()) for line in told]
     data: Json = {
         "outcome": "would-change",
         "commit": None,
@@ -203,8 +220,11 @@ def commit(
         **of_command,
     }
     if options.dry_run:
-        texts = (text for text in files.values() if text is not None and len(files) == 1)
-        shown = [f"    {line}" for text in texts for line in text.splitlines()]
+        current, shown = repo.file_reader(), list[str]()
+        for path, content in files.items():
+            file = FileChange(path, current(path), content)
+            diff = file.diff() if file.before else (content or "").splitlines()
+            shown += [f"    {line}" for line in diff]
         json_output.show(options.output, data, [*told, *shown, "nothing was changed"])
         return
     for line in told if options.output == "text" else ():

@@ -7,20 +7,22 @@ from dataclasses import asdict
 
 import click
 
+from demandops.base.runtime import REAL
 from demandops.cli.json_output import output_option, show
-from demandops.cli.output import SIGNS, progress, warn_of_problems
+from demandops.cli.output import SIGNS, errors, progress, warn_of_problems
 from demandops.cli.target import state_repo_option
 from demandops.decide.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 from demandops.decide.changeset import MergePreview, ReleaseChange, planned_releases, preview
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
+from demandops.repo.history import revisions
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 
 
 @click.command()
 @click.argument("before", metavar="A")
-@click.argument("after", metavar="B")
+@click.argument("after", metavar="[B]", default="", required=False)
 @state_repo_option
 @output_option
 def diff(before: str, after: str, state_repo: str, output: str) -> None:
@@ -28,11 +30,13 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 
     The command compares the bookkeeping, the releases and other files below clusters/. A and B are
     commits, or times like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
+    Without B, it shows what has changed since A.
 
     \b
     Examples:
+      demandops diff 1h
+      demandops diff 14:03
       demandops diff main~1 main
-      demandops diff 2h 0s
     """
     with reader.opened(state_repo) as repo:
         entries, changes = differences(repo, before, after)
@@ -64,9 +68,23 @@ def differences(
     return entries, preview(*planned, *texts)
 
 
+def resolved(repo: Reader, revision: str | None) -> str:
+    """Return the id of a commit; if a time names it, say which commit that is."""
+    commit, text = repo.commit(revision), revision or ""
+    time = revisions.parse_time(text, REAL.now(), end=True)
+    if time is not None and not commit.startswith(text.lower()):
+        entry = next(repo.log(commit))
+        errors.print(
+            f"{text} is {time:%Y-%m-%d %H:%M:%S} UTC: commit {commit[:10]} of "
+            f"{entry.time:%Y-%m-%d %H:%M:%S} UTC, {entry.summary}"
+        )
+    return commit
+
+
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
+    commit = resolved(repo, revision)
     with progress("reading the ledger") as report:
-        snapshot = repo.snapshot(revision, report)
+        snapshot = repo.snapshot(commit, report)
     warn_of_problems(repo, snapshot)
     return snapshot
 

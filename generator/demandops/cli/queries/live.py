@@ -24,7 +24,6 @@ from demandops.repo.reader import Reader
 from demandops.serve.agenda import parse_interval
 from demandops.views.kinds import HEALTH, KINDS, rows_of
 from demandops.views.rows import sorted_rows
-from demandops.views.vocabulary import commit_data
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 
@@ -86,7 +85,7 @@ def _screen(
     head = f"{repo.repository.address} at {source.commit[:10]}, {now:%H:%M:%S} UTC"
     counts = f"{len(releases)} releases, {len(demands)} demands"
     releases = sorted_rows(releases, HEALTH, now)
-    commits = log_table([commit_data(entry) for entry in islice(repo.log(), 6)], now)
+    commits = log_table(islice(repo.log(), 6), now)
     last = _part("Latest commits", commits, width, height // 3)
     room = height - _OTHER_LINES - len(last)
     running = list_table(KINDS["releases"], releases, now)

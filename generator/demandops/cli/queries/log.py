@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from datetime import datetime
 from itertools import islice
 from typing import Any
@@ -13,14 +14,15 @@ from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli.json_output import output_formats, show
 from demandops.cli.output import busy
-from demandops.cli.table import Table, column, table_of
+from demandops.cli.queries.diff import resolved
+from demandops.cli.table import Table, list_table
 from demandops.cli.target import name_options, state_repo_option
-from demandops.model.config.base_model import parse_time, relative
 from demandops.repo import reader
 from demandops.repo.history import revisions
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.reader import Reader
-from demandops.views.vocabulary import Json, commit_data, decision_text, time_text
+from demandops.views.kinds import KINDS, event
+from demandops.views.vocabulary import commit_data
 
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
@@ -106,6 +108,8 @@ def log(
       demandops log main~20..main -o wide
     """
     with reader.opened(state_repo) as repo:
+        for side in filter(None, (commit_range or "").split("..")):
+            resolved(repo, side)
         release, path = given.pop("release"), None
         if release is not None:
             tip = repo.commit((commit_range or "").rpartition("..")[2])
@@ -131,8 +135,8 @@ def log(
         with busy("looking through the commits"):
             if not (entries := list(islice(filter(matches, commits), max_count))):
                 _refuse_unknown(repo, given)
+    table = log_table(entries, REAL.now(), wide=output == "wide")
     rows = [commit_data(entry) for entry in entries]
-    table = log_table(rows, REAL.now(), wide=output == "wide")
     show(output, rows, [table if entries else "no commit matches"])
 
 
@@ -162,34 +166,6 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
         raise InvalidInput(faults)
 
 
-_COLUMNS = (
-    column("Commit", lambda row, now: row["commit"][:10]),
-    column("When", lambda row, now: relative(parse_time(row["time"]), now), 2),
-    column(
-        "What",
-        lambda row, now: [
-            row["summary"],
-            *([decision_text(row["decision"])] if row["decision"] else []),
-        ],
-    ),
-    column(
-        "Requesters",
-        lambda row, now: (
-            # the trailers name the requesters whose claims changed; a person asked for it
-            f"{row['author']}, for {', '.join(row['requesters'])}"
-            if row["operation"] in ("rollback", "reject")
-            else ", ".join(row["requesters"]) or row["author"]
-        ),
-        1,
-    ),
-)
-_WIDE = (
-    column("Time (UTC)", lambda row, now: time_text(row["time"]).removesuffix(" UTC")),
-    column("Operation", lambda row, now: row["operation"] or "by hand"),
-    column("Author", "author"),
-    column("Request", "request"),
-)
-
-
-def log_table(rows: list[Json], now: datetime, *, wide: bool = False) -> Table:
-    return table_of([*_COLUMNS, *(_WIDE if wide else ())], rows, now, whole=wide)
+def log_table(entries: Iterable[LogEntry], now: datetime, *, wide: bool = False) -> Table:
+    kind = KINDS["events"]
+    return list_table(kind, [kind.row(event(entry)) for entry in entries], now, wide=wide)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import click
 
 from demandops.cli import json_output
-from demandops.cli.output import at_option, busy
+from demandops.cli.output import at_option, busy, fitted, terminal_width
 from demandops.cli.queries.diff import loaded
 from demandops.cli.target import names_of, state_repo_option
 from demandops.model.config.base_model import duration_text
@@ -72,7 +72,7 @@ def lines_of(answer: Json) -> Iterator[str]:
         yield f"  denied by   {_override_text(answer['denied_by'])}"
     for release in answer.get("releases", ()):
         word = _OF_RELEASES.get(answer["kind"], "runs")
-        yield f"  {word:11} {release['name']} on {release['node']} ({release['file']})"
+        yield f"  {word:11} {release['name']} on {release['node']}"
     if answer.get("claims"):
         yield from _claim_lines(answer["claims"])
     if answer.get("shaped_by"):
@@ -188,11 +188,11 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
     show_default=True,
     help="List at most this many of the commits that changed the object.",
 )
-@json_output.output_option
+@json_output.output_formats("text", "json", "yaml", "jsonpath=…")
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:
-    """Explain why something runs or ran, who decided it, and what it held.
+    """Explain why something runs or ran, and who decided it.
 
     The command shows the requesters, the configuration and overrides that apply, open proposals,
     who approved or rejected, and the commits. NAME is the name of a thing of any kind that --kind
@@ -213,4 +213,4 @@ def why(
         source = Source.read(repo, snapshot, is_newest=not at, proposals=proposals)
         with busy("looking through the commits"):
             answer = explain(source, find(source, name, kind), most)
-    json_output.show(output, answer, lines_of(answer))
+    json_output.show(output, answer, (fitted(line, terminal_width()) for line in lines_of(answer)))

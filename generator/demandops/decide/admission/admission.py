@@ -6,9 +6,7 @@ check what the policy allows (:mod:`.permission`).
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 from itertools import chain
 
 from demandops.base.errors import Fault, fault, suggestion
@@ -19,24 +17,19 @@ from demandops.connections import connection_types
 from demandops.connections.connection import Connection
 from demandops.model.config.appdef import ApplicationDefinition, Services
 from demandops.model.config.config import (
-    BROKERS_FILE,
     CHARTS_FILE,
     DOMAINS_FILE,
     NODES_FILE,
     VERSIONS_FILE,
     Config,
 )
-from demandops.model.config.repo_settings import Limits
 from demandops.model.demand.demand import (
     LONGEST_S,
-    AnyDemand,
     Application,
     Connect,
     Delivery,
     Demand,
-    Item,
 )
-from demandops.model.demand.goals import ITEMS, too_large
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
 
@@ -77,36 +70,6 @@ def faults(request: Demand, config: Config) -> Iterator[Fault]:
         for each in chain(_id_faults("id", held.id), _requester_faults(item.requesters), of_held):
             if not (unplaced and each.field == "node"):
                 yield item.fault(each.field, each.message, code=each.code)
-
-
-def items_of(request: Demand) -> int:
-    items = len(request.own_requesters) + len(request.positions)
-    for item in request.demanded:
-        held = item.held
-        if isinstance(held, Application):
-            topics = sum(map(len, held.inputs.values()))
-            items += len(held.deliver) + len(held.named) + (held.place.size if held.place else 0)
-        else:
-            topics = len(held.topics)
-        items += len(item.requesters) if request.is_reference else 0
-        # each requester holds each topic of its item, so a topic counts once for each of them
-        items += (1 + topics) * max(1, len(item.requesters))
-    return items
-
-
-def size_faults(request: Demand, limits: Limits) -> Iterator[Fault]:
-    for item in request.demanded:
-        held = item.held
-        if isinstance(held, Application) and held.parameters:
-            size = len(json.dumps(dict(held.parameters), default=str))
-            if size > limits.parameter_bytes:
-                message = too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
-                yield item.fault("parameters", message, code="too-large")
-    items = items_of(request)
-    if items > limits.demand_items:
-        listed = f"lists {items} {ITEMS}"
-        message = too_large(listed, "demandItems", limits.demand_items)
-        yield fault("id" if request.is_reference else "demand", message, code="too-large")
 
 
 def _application_faults(app: Application, config: Config, claiming: bool) -> Iterator[Fault]:
@@ -311,31 +274,3 @@ def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
         yield from _id_faults(f"requesters[{index}]", requester)
     if not requesters:
         yield fault("requesters", "is empty; list at least one requester")
-
-
-def with_chosen_types(
-    request: AnyDemand, config: Config, current: Callable[[str], Connection | None]
-) -> AnyDemand:
-    if not request.adds_claims:
-        return request
-
-    notes, demanded = list(request.notes), list[Item]()
-    for item in request.demanded:
-        connection = item.held
-        if isinstance(connection, Connection) and connection.type is None:
-            # A claimed connection keeps its type. Else a new broker or node property would change
-            # the type that is chosen, and the request would contradict the other claims.
-            claimed = current(connection.id)
-            chosen = claimed.type if claimed else connection_types.choose_type(connection, config)
-            connection = replace(connection, type=chosen)
-        if isinstance(connection, Connection) and connection.type and connection.broker:
-            named = connection.broker
-            used = "" if id_problem(named) else connection.type.broker_node(connection, config)
-            if used not in ("", named):
-                notes.append(
-                    f"connection '{connection.id}' uses the broker on '{used}', because "
-                    f"{config.place_of(BROKERS_FILE)} has none on {quoted(named)}"
-                )
-                connection = replace(connection, broker=used)
-        demanded.append(replace(item, held=connection))
-    return replace(request, demanded=tuple(demanded), notes=tuple(notes))

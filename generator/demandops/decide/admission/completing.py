@@ -60,7 +60,7 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
         demand = flows.with_held_applications(demand, ledger, config)
     demand = carriers.with_implied_routes(demand, ledger, config)
     checkpoint()
-    # before what depends on the connection: its lease, type, permission, quota and approval
+    # before what depends on the connection: its lease, permission, quota and approval
     demand = carriers.with_carriers(demand, ledger, config)
     checkpoint()
     homes = [(item, config.domain_of.get(item.held.home)) for item in demand.demanded]
@@ -69,7 +69,6 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
         for item, home in homes
     )
     demand = replace(demand, demanded=tuple(leased))
-    demand = admission.with_chosen_types(demand, config, ledger.connection)
     possible = []
     for item in demand.demanded:
         # A client of the reference does not ask for the connections that it does not list, and gets

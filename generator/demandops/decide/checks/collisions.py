@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
-from itertools import chain, islice
+from itertools import islice
 from typing import TypeAlias
 
 from rpds import HashTrieMap, HashTrieSet
 
-from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, Refused, fault
-from demandops.base.naming import Subject, SubjectKind
 from demandops.connections.connection import ClientKey
 from demandops.decide import carriers
 from demandops.decide.booking import request_for
 from demandops.decide.planning import release_keys
-from demandops.decide.planning.flows import outputs, usual_topic
+from demandops.decide.planning.flows import outputs
 from demandops.decide.planning.planner import service_name
-from demandops.decide.planning.release_keys import ReleaseKey, is_needed, keys_of, keys_of_claims
+from demandops.decide.planning.release_keys import ReleaseKey, is_needed, keys_of_claims
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.demand.demand import Application, Demand
@@ -37,14 +34,17 @@ from demandops.model.release import ServiceKey
 
 
 def topic_faults(
-    request: Demand, before: World, after: World, keys: Iterable[ReleaseKey]
+    request: Demand, before: World, after: World, keys: Iterable[ReleaseKey], names: Names
 ) -> Iterator[Fault]:
-    """Yield a fault for each new service, route or delivery that clashes with another source."""
+    """Yield a fault for each new service, route or delivery that clashes with another source.
+
+    ``names`` are those of ``after``.
+    """
     if not request.adds_claims:
         return
     for key in keys:
         if isinstance(key, ServiceKey) and not is_needed(before, key):
-            yield from islice(_clashes_of_service(request, after, key), 1)
+            yield from islice(_clashes_of_service(request, after, key, names), 1)
     apps = request.applications
     chosen = any(app.place or {*app.services} - {*app.named} for app in apps)
     for item in request.demanded:
@@ -61,8 +61,8 @@ def topic_faults(
                 continue
             # Only services that run before and after the demand count. If an application moves, a
             # connection may bring the application's output back to the old node.
-            staying = (key for key, _ in publishers(before, node, topic) if is_needed(after, key))
-            for other in islice(staying, 1):
+            others = publishers(names, after, node, topic)
+            for other in islice((each for each in others if is_needed(before, each)), 1):
                 yield item.fault(
                     f"topics[{index}].{'source' if route.reverse else 'target'}",
                     f"connection '{connection.id}' brings {topic} to '{node}', where "
@@ -72,9 +72,9 @@ def topic_faults(
                 )
 
 
-def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
+def faults_of_claim(claim: Claim, before: World, after: World, names: Names) -> Iterator[Fault]:
     keys = keys_of_claims(after, [claim])
-    for clash in topic_faults(request_for(claim), before, after, keys):
+    for clash in topic_faults(request_for(claim), before, after, keys, names):
         yield clash.within(path_of(claim.key))
     for index, other in (
         () if claim.is_on_application else carriers.doubled(claim.connection, after.ledger)
@@ -86,26 +86,25 @@ def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault
         yield fault(f"topics[{index}]", message, code="conflict").within(path_of(claim.key))
 
 
-def _clashes_of_service(request: Demand, after: World, key: ServiceKey) -> Iterator[Fault]:
+def _clashes_of_service(
+    request: Demand, after: World, key: ServiceKey, names: Names
+) -> Iterator[Fault]:
     claim = next(iter(release_keys.claims_needing(after, key)), None)
     if claim is None:
         return
     first = after.ledger.application(claim.subject.id) or claim.application
     service = after.config.services[first.appdef][key.service]
-    further = False
-    if service.root is not None:
-        booked = after.ledger.booked_input(service.root, str(key.source), str(key.topic))
-        further = bool(booked and booked.further)
-    for name, topic in outputs(after.config, service, key, further=further).items():
-        published = (
+    for name, topic in topics_made(after, service, key).items():
+        clashes: list[tuple[str, ServiceKey | None]] = [
             (f"{words(other)} already publishes this topic on", other)
-            for other, _ in publishers(after, key.node, topic, excluded=key)
-        )
-        connections = (
+            for other in publishers(names, after, key.node, topic)
+            if other != key
+        ]
+        clashes += [
             (f"connection '{id}' already brings this topic to", None)
             for id in after.ledger.ids_with("brings", key.node, topic)
-        )
-        for clash, other in chain[tuple[str, ServiceKey | None]](published, connections):
+        ]
+        for clash, other in clashes:
             remedy = _remedy(key, other, service, name, after.config)
             message = (
                 f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}"
@@ -113,62 +112,18 @@ def _clashes_of_service(request: Demand, after: World, key: ServiceKey) -> Itera
             yield fault(_field(request, key, service), message, code="conflict")
 
 
-def publishers(
-    world: World, node: str, topic: str, *, excluded: ServiceKey | None = None
-) -> Iterator[tuple[ServiceKey, str]]:
-    """Yield the keys of the needed instances on a node that publish ``topic``, and the output."""
-    # The output patterns of the definitions tell which instances would publish the topic. So only
-    # these are looked up, and not the outputs of all services on the node.
-    for services in world.config.services.values():
-        for service in services.values():
-            for name, pattern in service.outputs.items():
-                first, *others = map(re.escape, pattern.split("{instance}"))
-                expression = first + "(.+)" + r"\1".join(others) if others else first
-                match = re.fullmatch(expression, topic)
-                if match is None:
-                    continue
-                keys: Iterable[ReleaseKey]
-                if others:
-                    keys = _keys_called(world, node, service, match[1], excluded)
-                elif service.scope == "cluster":
-                    keys = [ServiceKey(service.name, node, for_cluster=True)]
-                else:
-                    ids = world.ledger.ids_with("node", node)
-                    subjects = (Subject(SubjectKind.APPLICATION, id) for id in ids)
-                    keys = (key for subject in subjects for key in keys_of(world, subject))
-                for key in keys:
-                    if (
-                        isinstance(key, ServiceKey)
-                        and (key.node, key.service) == (node, service.name)
-                        and key != excluded
-                        and is_needed(world, key)
-                    ):
-                        yield key, f"{service.name}.{name}"
+def topics_made(world: World, service: Service, key: ServiceKey) -> dict[str, str]:
+    booked = None
+    if service.root is not None:
+        booked = world.ledger.booked_input(service.root, str(key.source), str(key.topic))
+    return outputs(world.config, service, key, further=bool(booked and booked.further))
 
 
-def _keys_called(
-    world: World, node: str, service: Service, instance: str, excluded: ServiceKey | None
-) -> Iterator[ServiceKey]:
-    """Yield keys on ``node`` that topic names show as ``instance``; some may not run."""
-    ledger, config = world.ledger, world.config
-    name, role = service.name, service.root
-    if service.scope in ("node", "cluster"):
-        if naming.topic_part(node) == instance:
-            yield ServiceKey(name, node, for_cluster=service.scope == "cluster")
-        return
-    if role is None:
-        for id in ledger.ids_with("topics", instance):
-            yield ServiceKey(name, node, application=id)
-        return
-    for source in config.nodes_by_topic_part.get(instance, ()):
-        usual = usual_topic(config, source, role)
-        is_own = excluded is not None and (excluded.service, excluded.source) == (name, source)
-        own = str(excluded.topic) if excluded and is_own else ""
-        for topic in (usual,) if usual else ledger.usual_topics(role, source, excluded=own):
-            yield ServiceKey(name, node, source=source, topic=topic)
-    for further, version in ledger.further_topics(role, instance):
-        own = "" if service.shared else version
-        yield ServiceKey(name, node, source=further.source, topic=further.topic, version=own)
+def publishers(names: Names, world: World, node: str, topic: str) -> Iterator[ServiceKey]:
+    """Yield the keys of the needed service instances on a node that publish a topic."""
+    for key in sorted(names.get((_TOPIC, f"{node} {topic}")) or (), key=words):
+        if isinstance(key, ServiceKey) and is_needed(world, key):
+            yield key
 
 
 def words(key: ReleaseKey) -> str:
@@ -222,8 +177,9 @@ def _field(request: Demand, key: ServiceKey, service: Service) -> str:
 # same name. A release's name is its file, its objects in a namespace, its ROS node and its client
 # at a broker. So no other release in the state repo may have it, on whatever node.
 
-# What is named, in words, and its name.
+# What is named, in words, and its name. A topic that a service publishes on its node is a name too.
 Name: TypeAlias = "tuple[str, str]"
+_TOPIC = "topic"
 
 # For each name, the keys of the releases that have it: one, if nobody wrote claims by hand. The
 # releases of suspended claims count too, because they will run again. A key that no claim needs any
@@ -247,6 +203,8 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
         # Nothing is named if the configuration no longer has the service.
         if service is not None and service.scope == key.scope:
             yield "release", service_name(world.config, service, key)
+            for topic in topics_made(world, service, key).values():
+                yield _TOPIC, f"{key.node} {topic}"
             return
 
 
@@ -285,8 +243,10 @@ def name_faults(
         for name in names_of(after, key):
             others = (names.get(name) or HashTrieSet()).discard(key)
             names = names.insert(name, others.insert(key))  # for the keys that follow
-            # a release keeps the name that it has, even if a person gave another one this name
-            if not others or not is_needed(after, key) or is_needed(before, key):
+            # A release keeps the name that it has, even if a person gave another one this name.
+            # topic_faults tells of topics.
+            is_new = is_needed(after, key) and not is_needed(before, key) if others else False
+            if name[0] == _TOPIC or not is_new:
                 continue
             for other in islice((each for each in others if is_needed(after, each)), 1):
                 claims = {change.key.subject: change.key for change in changes.claims}
@@ -326,7 +286,7 @@ def refuse_shared_names(world: World, keys: Iterable[ReleaseKey]) -> None:
         (key, name, taken[name])
         for key in keys
         for name in names_of(world, key)
-        if taken.setdefault(name, key) != key
+        if name[0] != _TOPIC and taken.setdefault(name, key) != key
     ]
     if clashes:
         raise Refused(fault("", _message(*clash), code="conflict") for clash in clashes)

@@ -16,7 +16,7 @@ from typing import Generic, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.base.quoting import quoted
-from demandops.decide.admission import admission, permission
+from demandops.decide.admission import permission
 from demandops.decide.placement import candidates
 from demandops.decide.placement.candidates import (
     NO_ROOM,
@@ -31,6 +31,7 @@ from demandops.decide.placement.capacity import NoRoom, Usage
 from demandops.decide.state import State
 from demandops.model.config.appdef import Service
 from demandops.model.demand.demand import Application, Demand, Item, Requirement
+from demandops.model.demand.goals import items_of
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World
 
@@ -286,7 +287,7 @@ class _Places(Generic[_Result]):
     def _tried(self, demanded: tuple[Item, ...]) -> _Result:
         request = replace(self._request, demanded=demanded)
         self._attempts += 1
-        self._items += admission.items_of(request)
+        self._items += items_of(request)
         most = self._state.config.repo_settings.limits.demand_items
         if self._attempts > MOST_ATTEMPTS or self._items > most:
             raise OverBudget(

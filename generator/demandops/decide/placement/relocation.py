@@ -313,7 +313,7 @@ def _faults(
     for change in changes:
         if not (claim := change.after):
             continue
-        yield from collisions.faults_of_claim(claim, before, after)
+        yield from collisions.faults_of_claim(claim, before, after, names)
         if not claim.is_on_application:
             former = change.before.connection.topics if change.before else ()
             held = after.ledger.claims_of_demand(claim.demand)

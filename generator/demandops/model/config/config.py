@@ -97,10 +97,6 @@ class Config:
     entry_files: Mapping[str, Mapping[str, str]] = field(
         default_factory=dict, compare=False, repr=False
     )
-    # A map from each `topic_part(id)` to the ids of the nodes that have this topic part
-    nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
-        init=False, compare=False, repr=False
-    )
     # For each role, the nodes with this `type`, sorted by id. The empty role has all nodes.
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
     # For each `(capability,)` or `(label key, value)`, the nodes with it, sorted by id
@@ -120,11 +116,8 @@ class Config:
     )
 
     def __post_init__(self) -> None:
-        by_topic_part: dict[str, tuple[str, ...]] = {}
         by_kind: dict[str, dict[Kind, list[str]]] = {}
         for id, node in self.nodes.items():
-            part = naming.topic_part(id)
-            by_topic_part[part] = (*by_topic_part.get(part, ()), id)
             for name, value in node.properties.items():
                 ids_by_kind = by_kind.setdefault(name, {})
                 ids_by_kind.setdefault(kind_of(value) or "text", []).append(id)
@@ -141,7 +134,6 @@ class Config:
                 by_trait.setdefault(trait, []).append(node)
         services = [s for services in self.services.values() for s in services.values()]
         indexes = {
-            "nodes_by_topic_part": by_topic_part,
             "nodes_by_role": {role: tuple(nodes) for role, nodes in by_role.items()},
             "nodes_with": {trait: tuple(nodes) for trait, nodes in by_trait.items()},
             "property_kinds": {name: (kind, ids[0]) for name, (kind, ids) in kinds.items()},

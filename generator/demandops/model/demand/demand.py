@@ -14,7 +14,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Container, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta, timezone
-from functools import cached_property
 from itertools import islice, takewhile
 from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -29,7 +28,6 @@ from pydantic import (
 )
 from pydantic.json_schema import SkipJsonSchema
 
-from demandops.base import naming
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import Subject, SubjectKind, TopicKey, absolute_topic
 from demandops.base.quoting import quoted
@@ -62,9 +60,6 @@ class InputTopic:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "topic", absolute_topic(self.topic))
-
-    def part_in(self, version: str) -> str:
-        return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
 
     def distinguishing_text(self, further: bool, version: str) -> str:
         if not further:
@@ -245,15 +240,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         same = takewhile(lambda t: (t.topic, t.source) == place, islice(inputs, start, None))
         return tuple(same)
 
-    @cached_property
-    def further_by_part(self) -> dict[tuple[str, str], list[InputTopic]]:
-        # computed only once, because the plans of many services need it
-        by_part: dict[tuple[str, str], list[InputTopic]] = {}
-        for role, topic in self.all_inputs():
-            if topic.further or self.separate:
-                by_part.setdefault((role, topic.part_in(self.own_version)), []).append(topic)
-        return by_part
-
     def needs(self, node: str) -> bool:
         delivered = any(delivery.node == node for delivery in self.deliver)
         return delivered or node in self.needed_nodes()
@@ -355,17 +341,12 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
                 yield ("reads", topic.application)
             yield ("from", topic.source)
             yield ("node", topic.source)
-            if topic.further or self.separate:
-                yield ("further", topic.part_in(self.own_version))
             if not topic.further:
-                # with and without the topic, so that the claims with another topic can be counted
                 yield ("usual", topic.source, role)
-                yield ("usual", topic.source, role, topic.topic)
         if self.version:
             yield ("version", self.id, self.version)
         for delivery in self.deliver:
             yield ("node", delivery.node)
-        yield ("topics", naming.topic_part(self.id))
 
 
 def _exact(values: Mapping[str, object]) -> str:

@@ -340,13 +340,15 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
     if isinstance(goal, Demand):
         return goal
     try:
-        # exactly what a restart would read from the journal, so that it decides the same
-        goal = json.loads(json.dumps(goal))
+        text = json.dumps(goal, separators=(",", ":"))
     except (TypeError, ValueError, RecursionError):
         raise Refused([_NOT_PLAIN]) from None
     # before anything is parsed, because the parser's work grows with the goal
-    if large := list(length_faults(goal, limits)):
-        raise Refused(large)
+    if len(text) > (most := limits.demand_characters):
+        message = _too_large(f"has {len(text)} characters", "demandCharacters", most)
+        raise Refused.at("", message, code="too-large")
+    # exactly what a restart would read from the journal, so that it decides the same
+    goal = json.loads(text)
     faults: list[Fault] = []
     data = _in_one_form(goal, (), faults)
     if not isinstance(data, dict):
@@ -361,7 +363,10 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
         raise Refused([*faults, *faults_of(error, model, most=MOST_FAULTS)]) from None
     if faults := [*faults, *parsed.faults()]:
         raise Refused(faults)
-    return replace(parsed.read(), goal=data)
+    demand = replace(parsed.read(), goal=data)
+    if faults := [*size_faults(demand, limits)]:
+        raise Refused(faults)
+    return demand
 
 
 def is_unicode(text: str) -> bool:
@@ -475,57 +480,43 @@ def goal_field(field: str, demand: Demand, roles: Mapping[str, Mapping[str, str]
     return f"{item}.{_BODY}{f'.{listed}' if listed else ''}{bracket}{place}"
 
 
-# ---- the size of a goal ----
-
-# The lists in these fields have no items of their own. The size of parameters is limited in bytes
-# instead, and each target topic belongs to a source topic, which counts.
-_NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
-# About ten fields describe any item. Unknown fields are bounded too, because each would cost a
-# fault when the goal is parsed.
-_FIELDS_OF_ITEM = 10
-ITEMS = (
-    "items (applications, connections, topics, requesters and so on, also of the connections that "
-    "it needs)"
-)
+# ---- the size of a demand ----
 
 
-def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
-    """Yield a fault if a goal, as plain data, is far too large to be parsed at all."""
-    length = items = fields = 0
-    most_fields = max(1_000, _FIELDS_OF_ITEM * limits.demand_items)
-    # The walk ends as soon as a limit is passed, so that a huge goal costs no more than the limit.
-    # It keeps a list instead of calling itself, because a goal may be nested to any depth.
-    unread: list[tuple[object, bool]] = [(goal, True)]
-    while (
-        unread
-        and length <= limits.demand_characters
-        and items <= limits.demand_items
-        and fields <= most_fields
-    ):
-        value, counts = unread.pop()
-        if isinstance(value, str):
-            length += len(value)
-        elif isinstance(value, list):
-            length += 2 * len(value)  # each part is at least a character and a comma
-            items += len(value) if counts else 0
-            unread += [(part, counts) for part in value]
-        elif isinstance(value, dict):
-            fields += len(value)
-            length += sum(1 + len(key) if isinstance(key, str) else 1 for key in value)
-            unread += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
-        elif isinstance(value, int):
-            length += value.bit_length() // 4
-    for count, most, verb, what, limit in (
-        (length, limits.demand_characters, "has", "characters", "demandCharacters"),
-        (fields, most_fields, "has", "fields", "demandItems"),
-        (items, limits.demand_items, "lists", ITEMS, "demandItems"),
-    ):
-        if count > most:
-            message = too_large(f"{verb} more than {most} {what}", limit, most)
-            yield fault("", message, code="too-large")
+def items_of(request: Demand) -> int:
+    items = len(request.own_requesters) + len(request.positions)
+    for item in request.demanded:
+        held = item.held
+        if isinstance(held, Application):
+            topics = sum(map(len, held.inputs.values()))
+            items += len(held.deliver) + len(held.named) + (held.place.size if held.place else 0)
+        else:
+            topics = len(held.topics)
+        items += len(item.requesters) if request.is_reference else 0
+        # each requester holds each topic of its item, so a topic counts once for each of them
+        items += (1 + topics) * max(1, len(item.requesters))
+    return items
 
 
-def too_large(size: str, limit: str, most: int) -> str:
+def size_faults(request: Demand, limits: Limits) -> Iterator[Fault]:
+    for item in request.demanded:
+        held = item.held
+        if isinstance(held, Application) and held.parameters:
+            size = len(json.dumps(dict(held.parameters), default=str))
+            if size > limits.parameter_bytes:
+                message = _too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
+                yield item.fault("parameters", message, code="too-large")
+    items = items_of(request)
+    if items > limits.demand_items:
+        listed = (
+            f"lists {items} items (applications, connections, topics, requesters and so on, also "
+            "of the connections that it needs)"
+        )
+        message = _too_large(listed, "demandItems", limits.demand_items)
+        yield fault("id" if request.is_reference else "demand", message, code="too-large")
+
+
+def _too_large(size: str, limit: str, most: int) -> str:
     return (
         f"{size}, but at most {most} are allowed; a platform engineer may raise limits.{limit} in "
         f"{ROOT_FILE}"

@@ -40,10 +40,8 @@ By = Literal[
     "takes",  # source and topic of an input
     "reads",  # the application of an output that is an input
     "from",  # the node of which it reads a topic, or carries one
-    "further",  # the part of a topic's name for an input that is not the usual topic
-    "usual",  # source and role; also with the topic
+    "usual",  # source and role
     "version",  # application and version
-    "topics",  # the part of a topic's name that replaces `{instance}`
     "link",  # type of the connection, and one of its nodes
     "broker",  # the node
     "route",  # the words of a RouteKey
@@ -130,22 +128,6 @@ class Ledger:
             if inputs := claim.application.inputs_from(role, source, topic):
                 return inputs[0]
         return None
-
-    def usual_topics(self, role: str, source: str, *, excluded: str) -> Iterator[str]:
-        same = self.keys_with("usual", source, role, excluded)
-        if len(self.keys_with("usual", source, role)) == len(same):
-            return  # all these claims have the topic ``excluded``
-        claims = self.each_with("usual", source, role)
-        inputs = (topic for claim in claims for topic in claim.application.inputs.get(role, ()))
-        usual = {topic.topic for topic in inputs if topic.source == source and not topic.further}
-        yield from sorted(usual - {excluded})
-
-    def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        # (input, version of a separate instance), for inputs that topic names show as `part`
-        for claim in self.claims_with("further", part):
-            app = claim.application
-            further = app.further_by_part.get((role, part), ())
-            yield from ((topic, app.own_version) for topic in further)
 
     def claims_of_demand(self, demand: str) -> tuple[Claim, ...]:
         return self.claims_with("demand", demand)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import os
 import subprocess
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -109,3 +110,10 @@ def run_git(
         errors="surrogateescape",
         check=False,
     )
+
+
+# ---- who is told that git takes long with a remote ----
+
+# A slow run of git calls each, each second, with a text about what git does, and with an empty text
+# when git has ended.
+listeners: list[Callable[[str], None]] = []

@@ -35,8 +35,6 @@ from demandops.repo.git.repository import MAIN, RemoteAway, StateRepository, Una
 
 log = logging.getLogger("demandops")
 
-Notify = Callable[[str], None]
-
 # ---- one git command with a remote, and what came of it ----
 
 # A server that asks for more patience than this is asked again all the same.
@@ -159,17 +157,6 @@ _REMEDIES = (
 _NO_FILE = re.compile(r"unable to access '[^':]*':.*")
 
 
-# ---- who is told that git takes long with a remote ----
-
-_listeners: list[Callable[[str], None]] = []
-
-
-def listen(listener: Callable[[str], None]) -> None:
-    # It replaces the earlier one. A slow run of git calls it each second with a text about what git
-    # does, and with an empty text when git has ended.
-    _listeners[:] = [listener]
-
-
 # ---- the clone ----
 
 _REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
@@ -198,7 +185,7 @@ class RemoteRepository(StateRepository):
     main_reference = _REMOTE_MAIN
     branches = "refs/remotes/origin/"
 
-    def __init__(self, url: str, folder: Path, notify: Notify, allow_offline: bool) -> None:
+    def __init__(self, url: str, folder: Path, *, allow_offline: bool = False) -> None:
         self.address = without_secrets(url)
         self._url = url
         self._folder = folder
@@ -208,7 +195,7 @@ class RemoteRepository(StateRepository):
         for lock in folder.rglob("*.lock"):
             lock.unlink(missing_ok=True)
         if not self._is_usable():
-            self._clone(notify)
+            self._clone()
         self._open()
         try:
             self.refresh()
@@ -243,12 +230,12 @@ class RemoteRepository(StateRepository):
             return False
         text = "the clone %s does not pass git's check (%s); making it anew"
         log.warning(text, self._folder, checked.words)
-        self._clone(log.info)
+        self._clone()
         self._open()
         return True
 
-    def _clone(self, notify: Notify) -> None:
-        notify(f"cloning {self.address}")
+    def _clone(self) -> None:
+        log.info("cloning %s", self.address)
         folder = self._folder
         folder.parent.mkdir(parents=True, exist_ok=True)
         # a killed process must not leave half a clone under the final name
@@ -415,7 +402,7 @@ class RemoteRepository(StateRepository):
                 took = REAL.monotonic() - start
                 if int(took) > told:
                     told, doing = int(took), _DOING.get(command[0], "asking")
-                    for listener in _listeners:
+                    for listener in child_processes.listeners:
                         listener(f"{doing} {self.address}, {told} s")
                 self.while_waiting()
                 if urgent():
@@ -427,7 +414,7 @@ class RemoteRepository(StateRepository):
             if process.returncode is None:
                 _terminate(process)
             self._process = None
-            for listener in _listeners if told else ():
+            for listener in child_processes.listeners if told else ():
                 listener("")
         texts = [text.decode("utf-8", "replace") for text in (out, err)]
         code, took = process.returncode, REAL.monotonic() - start
@@ -462,9 +449,9 @@ def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
 class PushedRepository(RemoteRepository):
     on_this_disk = True
 
-    def __init__(self, place: StateRepository, folder: Path, notify: Notify) -> None:
+    def __init__(self, place: StateRepository, folder: Path) -> None:
         self._place = place
-        super().__init__(str(Path(place.objects.path).resolve()), folder, notify, False)
+        super().__init__(str(Path(place.objects.path).resolve()), folder)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         # to look is cheap, to fetch is not; git says why the repository cannot be read
@@ -514,7 +501,6 @@ def is_url(address: str) -> bool:
 def connect(
     address: str,
     folder: Path,
-    notify: Notify = lambda text: None,
     *,
     allow_offline: bool = False,
     only_read: bool = False,
@@ -542,7 +528,7 @@ def connect(
                 f"the state repo's address names no host after '{no_host[1]}://'; write "
                 f"{no_host[1]}://HOST/PATH, or the folder of a bare repository"
             )
-        return RemoteRepository(address, folder / "clone.git", notify, allow_offline)
+        return RemoteRepository(address, folder / "clone.git", allow_offline=allow_offline)
     try:
         path = Path(address).expanduser()
         is_folder, exists = path.is_dir(), path.exists()
@@ -565,4 +551,4 @@ def connect(
     repository = StateRepository(path)
     if only_read or not repositories.needs_push(address):
         return repository
-    return PushedRepository(repository, folder / "clone.git", notify)
+    return PushedRepository(repository, folder / "clone.git")

@@ -33,8 +33,7 @@ from demandops.base.errors import Fault, InvalidInput, fault, field_path
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.decide import changeset
-from demandops.decide.changeset import trial_releases
-from demandops.decide.state import State
+from demandops.decide.state import State, trial_releases
 from demandops.model.config.config import DOMAINS_FILE, Config
 from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease

@@ -1,4 +1,4 @@
-"""``demandops request``: book demand requests from files, without ROS."""
+"""``demandops demand``: book the demands of files in a state repo, or send them to a node."""
 
 from __future__ import annotations
 
@@ -27,8 +27,15 @@ from demandops.cli.changes.ledger_change import started_generator
 from demandops.cli.json_output import faults_of, output_option, print_json
 from demandops.cli.output import console, done, errors, progress
 from demandops.cli.queries.diff import release_lines
-from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
+from demandops.cli.target import (
+    NO_STATE_REPO,
+    dry_run_option,
+    hint_to_pull,
+    optional_repo_option,
+    signing_option,
+)
 from demandops.decide.decision import decide
+from demandops.model.config.base_model import duration_text
 from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
 from demandops.serve.approvals.proposal import parse_waiting_text
@@ -50,15 +57,15 @@ class Document:
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
 
-    def as_release(self) -> Document:
+    def as_operation(self, operation: str) -> Document:  # release or renew
         goal = self.goal
         if not isinstance(goal, dict):  # the check of goals refuses it later
             return self
         if not is_demand_goal(goal):
-            return replace(self, goal={**goal, "shutdown": True})
+            return replace(self, goal={**goal, "shutdown": operation == "release"})
         names = ("apiVersion", "kind", "demand", "request", "requesters")
         given = {name: goal[name] for name in names if name in goal}
-        return replace(self, goal=given | {"operation": "release"})
+        return replace(self, goal=given | {"operation": operation})
 
 
 class _Answer(Future["Receipt | dict[str, str]"]):
@@ -101,11 +108,23 @@ class _Answer(Future["Receipt | dict[str, str]"]):
 
 
 @click.command()
-@click.argument("files", nargs=-1, required=True, metavar="FILE…")
-@writable_repo_option
-@dry_run_option
+@click.argument("files", nargs=-1, required=True, metavar="FILE…", type=click.Path(allow_dash=True))
 @click.option(
-    "--release", is_flag=True, help="Release the demands of the documents instead of booking them."
+    "--via",
+    type=click.Choice(["git", "ros"]),
+    is_eager=True,  # over ROS, no state repo is needed
+    help="Book directly in the state repo (git), or send to a running node (ros). Default: git, if "
+    "a state repo is at hand.",
+)
+@optional_repo_option
+@dry_run_option
+@click.option("--release", is_flag=True, help="Release the demands of the documents instead.")
+@click.option("--renew", is_flag=True, help="Renew the demands of the documents instead.")
+@click.option(
+    "--hold",
+    is_flag=True,
+    is_eager=True,
+    help="Over ROS: renew the demands until Ctrl-C, then release them.",
 )
 @click.option(
     "--wait",
@@ -114,56 +133,125 @@ class _Answer(Future["Receipt | dict[str, str]"]):
     "ends once they are proposed, and the next generator that starts on this machine for this "
     "state repo continues with them.",
 )
+@click.option("--action", metavar="NAME", help="Over ROS: the name of the node's action Demand.")
+@click.option(
+    "--timeout",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="Over ROS: how long to wait for the node and its answer together. Default: 60.",
+)
 @signing_option
 @output_option
-def request(
+def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     files: tuple[str, ...],
+    via: str | None,
     state_repo: str,
     dry_run: bool,
     release: bool,
+    renew: bool,
+    hold: bool,
     wait: bool,
+    action: str | None,
+    timeout: float | None,
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Book demand requests from files.
+    """Demand what files ask for: book it, or send it to a node.
 
-    FILE contains goals of the action DeploymentRequest as YAML, as for `ros2 action send_goal`, or
-    documents of the kind Demand (docs/demand.md). Write - for standard input. If the command cannot
-    parse one of the documents, it books none. Otherwise it books the documents in order. If one of
-    them is refused, the command still books the others.
+    FILE contains documents of the kind Demand (docs/demand.md), or goals of the action
+    DeploymentRequest as YAML, as for `ros2 action send_goal`. Write - for standard input. With a
+    state repo at hand, the command books directly in it; otherwise, and with --via ros, it sends
+    the documents of the kind Demand over ROS 2 to a running node. If it cannot parse one of the
+    documents, it takes none. Otherwise it takes the documents in order, also if one is refused.
 
     \b
     Examples:
-      demandops request visit.yaml
-      demandops request visit.yaml --dry-run
-      demandops request visit.yaml --release
-      demandops request - --wait
+      demandops demand visit.yaml
+      demandops demand visit.yaml --dry-run
+      demandops demand visit.yaml --release
+      demandops demand visit.yaml --via ros --hold
+      demandops demand - --wait
     """
+    if hold + release + renew > 1:
+        raise click.UsageError("--hold, --release and --renew cannot be combined")
+    of_ros = hold or action is not None or timeout is not None
+    over_ros = via == "ros" or (via is None and (of_ros or not state_repo))
+    if over_ros and (dry_run or wait):
+        only = "--dry-run" if dry_run else "--wait"
+        raise click.UsageError(f"{only} needs a state repo, and not --via ros; {NO_STATE_REPO}")
+    if not over_ros and of_ros:
+        raise click.UsageError("--hold, --action and --timeout are for --via ros")
+    if not over_ros and not state_repo:
+        raise click.UsageError(NO_STATE_REPO)
     documents = []
     for file in files:
         name, text = read_input(file)
         goals = enumerate(strict_yaml.load_all(text, name))
         documents += [Document(name, goal, text, at) for at, goal in goals if goal is not None]
-    if release:
-        documents = [document.as_release() for document in documents]
+    if release or renew:
+        operation = "release" if release else "renew"
+        documents = [document.as_operation(operation) for document in documents]
     if not documents:
-        raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
-    if any(form_faults(document.goal) for document in documents):
-        rows = [_unbooked(index, document) for index, document in enumerate(documents)]
-    elif dry_run:
-        rows = _dry_run(documents, state_repo, output)
+        raise InvalidInput([fault("", f"no demand in {', '.join(files)}; write one")])
+    is_unread = any(form_faults(document.goal) for document in documents)
+    if over_ros and not is_unread:
+        rows = _send(documents, hold, action, timeout, output)
     else:
-        rows = _book(documents, state_repo, wait, signing_key)
-    if output == "json":
-        print_json(rows)
-    else:
-        _print_rows(rows, documents, dry_run)
+        if is_unread:
+            rows = [_unbooked(index, document) for index, document in enumerate(documents)]
+        elif dry_run:
+            rows = _dry_run(documents, state_repo, output)
+        else:
+            rows = _book(documents, state_repo, wait, signing_key)
+        _show_rows(rows, documents, output, dry_run)
+    if via is None and output == "text" and not is_unread:
+        way = f"directly in the state repo {state_repo}; to send it to a node: --via ros"
+        errors.print("(by a node, over ROS)" if over_ros else f"({way})")
     unanswered = sum(_is_unanswered(row) for row in rows) if not dry_run else 0
     if unanswered:
         errors.print(f"{len(rows) - unanswered} of {len(rows)} requests have an answer")
         raise click.Abort
-    if any(row["outcome"] == "refused" for row in rows):
+    if any(row["outcome"] in ("refused", "unknown") for row in rows):
         raise click.exceptions.Exit(1)
+
+
+def _send(
+    documents: list[Document], hold: bool, action: str | None, timeout: float | None, output: str
+) -> list[Json]:
+    for document in documents:
+        if not is_demand_goal(document.goal):
+            message = "is not Demand; book a DeploymentRequest with --via git, without a node"
+            raise InvalidInput([fault("kind", message).within(document.file)])
+    # only here, because booking works without ROS
+    from demandops.cli.main import imported  # noqa: PLC0415
+
+    ros = imported("demand", "demandops_ros.demand_command")
+    goals = [document.goal for document in documents]
+    rows = []
+    with ros.sent(goals, hold, action, timeout, lambda text: _tell(text, output)) as answers:
+        for index, (document, answer) in enumerate(zip(documents, answers, strict=True)):
+            if isinstance(answer, DemandOpsError):
+                rows.append(_refused(index, document, answer))
+                # nobody knows whether a demand is booked whose answer did not come in time
+                if any(each["code"] == "timeout" for each in rows[-1]["faults"]):
+                    rows[-1]["outcome"] = "unknown"
+            else:
+                rows.append(_row(index, document.request_id, **answer))
+                done.append(f"{answer['outcome']} in {answer['commit']}")
+        _show_rows(rows, documents, output, dry_run=False)
+    return rows
+
+
+def _tell(text: str, output: str) -> None:
+    if output == "text":
+        errors.print(text)
+
+
+def _show_rows(rows: list[Json], documents: list[Document], output: str, dry_run: bool) -> None:
+    if output == "json":
+        print_json(rows)
+    else:
+        _print_rows(rows, documents, dry_run)
 
 
 def _is_unanswered(row: Json) -> bool:
@@ -171,7 +259,7 @@ def _is_unanswered(row: Json) -> bool:
     return row["outcome"] == "waiting" and row["commit"] is None
 
 
-def _row(index: int, request_id: str, outcome: str, **more: object) -> Json:
+def _row(index: int, request_id: str, outcome: str, **more: Any) -> Json:  # noqa: ANN401
     return {
         "index": index,
         "request": request_id,
@@ -272,19 +360,24 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
     return rows
 
 
-def _print_rows(rows: list[Json], documents: list[Document], dry_run: bool) -> None:
+def _print_rows(  # noqa: PLR0912 - a part of a row each
+    rows: list[Json], documents: list[Document], dry_run: bool
+) -> None:
     out = console()
     for row, document in zip(rows, documents, strict=True):
         title = f"{document.file}: request {row['index']} '{one_line(row['request'])}'"
         if not dry_run and _is_unanswered(row):
             errors.print(f"{title} has no answer yet")
-        elif row["outcome"] == "refused":
-            errors.print(f"{title} refused")
+        elif row["outcome"] in ("refused", "unknown"):
+            known = "refused" if row["outcome"] == "refused" else "has no known outcome"
+            errors.print(f"{title} {known}")
             for each in row["faults"]:
                 errors.print(f"  {Fault(**each)}")
         elif not dry_run:
-            told, proposal = f"{row['outcome']} in {row['commit']}", row.get("proposal")
-            if proposal is not None:
+            told = row["outcome"] + (f" in {row['commit']}" if row["commit"] else "")
+            if row.get("lease"):
+                told += f", for {duration_text(row['lease'])} unless renewed"
+            if proposal := row.get("proposal"):
                 told = f"awaiting approval {proposal['branch']} {proposal['link']}".rstrip()
             out.print(f"{title} {told}", soft_wrap=True)
         for choice in row["placed"]:
