@@ -17,10 +17,10 @@ WORDS = st.text("abc 車-/", max_size=40)
 
 def test_text_wraps_and_what_matters_least_is_left_out() -> None:
     assert Table(COLUMNS, ROWS).lines(80) == [
-        "NAME                                          STATE    REASON",
-        "of-edge-object-detection-fusion-cf7e0180a8bb  failing  Helm install failed:",
-        "                                                       timed out waiting",
-        "more columns in a wider terminal: SINCE",
+        "NAME                                          STATE    REASON          SINCE",
+        "of-edge-object-detection-fusion-cf7e0180a8bb  failing  Helm install    2h ago, b",
+        "                                                       failed: timed",
+        "                                                       out waiting",
     ]
     assert Table(COLUMNS, ROWS).lines(60) == [
         "NAME                                          STATE",

@@ -20,7 +20,7 @@ from demandops.views.rows import TONES, Row, utc
 _GAP = "  "
 # The smallest width, in characters, to which a column is narrowed by wrapping its text.
 # If the terminal has no room for this width, columns are left out.
-_COMFORT = 20
+_COMFORT = 12
 
 Cell = str | Sequence[str]  # several texts are joined by commas
 
