@@ -120,8 +120,8 @@ def test_every_command_that_writes_signs(
     made = [state.tip]
     book("a")
     made.append(state.tip)
-    for command in ("rollback main~1 -m x --drop-newer", "decommission vehicle00", "upgrade"):
-        if command == "decommission vehicle00":
+    for command in ("rollback main~1 -y -m x --drop-newer", "decommission -y vehicle00", "upgrade"):
+        if command == "decommission -y vehicle00":
             book("a")
         elif command == "upgrade":  # removes a file, so that it renders something
             state.commit({next(iter(state.manifests())): None})

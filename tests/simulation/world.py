@@ -153,12 +153,12 @@ class Clone(RemoteRepository):
 
     def __init__(self, machine: Machine, folder: Path, allow_offline: bool) -> None:
         self._machine = machine
-        super().__init__(machine.name, folder, lambda text: None, allow_offline)
+        super().__init__(machine.name, folder, allow_offline=allow_offline)
 
     def tidy(self) -> None:
         """Do not repack, because all clones share one folder of git objects."""
 
-    def _clone(self, notify: Callable[[str], None]) -> None:
+    def _clone(self) -> None:
         shutil.rmtree(self._folder, ignore_errors=True)
         partial = self._folder.with_name("partial")
         shutil.rmtree(partial, ignore_errors=True)
@@ -282,7 +282,7 @@ class World:
     def running(self) -> Iterator[None]:
         by_name = {machine.name: machine for machine in self.machines}
 
-        def connect(address: str, folder: Path, notify: object, *, allow_offline: bool) -> Clone:
+        def connect(address: str, folder: Path, *, allow_offline: bool) -> Clone:
             return Clone(by_name[address], folder / "clone.git", allow_offline)
 
         def sync(handle: int) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 
+from demandops.base import strict_yaml
 from demandops.base.errors import DemandOpsError, InvalidInput, fault
 from demandops.base.quoting import json_escaped, lines
 from demandops.cli.output import painted, print_lines, terminal_width
@@ -68,6 +69,9 @@ output_option = output_formats("text", "json")
 def show(output: str, data: object, text: Iterable[str | Table]) -> None:
     if output == "json":
         print_json(data)
+        return
+    if output == "yaml":
+        click.echo(strict_yaml.dump(json.loads(json.dumps(data))), nl=False)
         return
     if output.startswith(_PATH):
         click.echo(lines(filled(output.removeprefix(_PATH), data)))

@@ -45,6 +45,7 @@ COMMANDS = {
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
     "log": ("queries.log", "List the commits of the state repo, newest first."),
+    "may": ("queries.may", "Say whether a requester may demand an application, and why."),
     "new": ("authoring.new", "Write a new application or image."),
     "override": ("changes.override", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
@@ -54,6 +55,10 @@ COMMANDS = {
     "release": (
         "changes.ledger_change",
         "Stop one demand, or an application for all who demand it.",
+    ),
+    "reconcile": (
+        "changes.reconcile",
+        "Let Flux or Argo CD fetch now, and not at its next interval.",
     ),
     "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),
     "resume": ("changes.override", "Run suspended applications and connections again."),
@@ -82,43 +87,26 @@ ALIASES = {
     "request": ["demand", "--via", "git"],
 }
 
-# What people look for by the words of other programs.
+# What is meant by words of other programs.
 _LEADS = {
-    "apply": "demand FILE, or git push for configuration",
-    "auth": "may REQUESTER demand APPLICATION",
-    "can-i": "may REQUESTER demand APPLICATION",
-    "cancel": "release DEMAND",
-    "cordon": "drain NODE",
-    "create": "demand FILE, or override create NAME",
-    "delete": "release DEMAND|APPLICATION, or override end NAME",
-    "edit": "override create NAME",
-    "explain": "why NAME, or schema KIND",
-    "freeze": "override create NAME --refuse-new --until 2h",
-    "history": "log",
-    "install": "demand FILE",
-    "lint": "check",
-    "list": "get KIND",
-    "logs": "why NAME, and kubectl logs",
-    "ls": "get KIND",
-    "move": "override create NAME --on NODE",
-    "pause": "suspend",
-    "pin": "override create NAME --use-version VERSION",
-    "plan": "check, or any command with --dry-run",
-    "ps": "get releases",
-    "remove": "release DEMAND|APPLICATION, or override end NAME",
-    "rm": "release DEMAND|APPLICATION, or override end NAME",
-    "rollout": "status, or rollback TIME",
-    "scale": "override create NAME --replicas N",
-    "show": "why NAME",
-    "stop": "release DEMAND|APPLICATION, or suspend",
-    "sync": "reconcile",
-    "top": "get nodes",
-    "trace": "why NAME",
-    "tree": "why NAME",
-    "uncordon": "undrain NODE",
-    "undo": "revert COMMIT, or rollback TIME",
-    "uninstall": "release DEMAND|APPLICATION",
-    "validate": "check",
+    "check": "lint plan template validate",
+    "demand FILE": "apply create install",
+    "drain NODE": "cordon",
+    "get KIND": "list ls ps top",
+    "log": "history",
+    "may REQUESTER demand APPLICATION": "auth can-i",
+    "override create NAME --on NODE": "move",
+    "override create NAME --refuse-new --until 2h": "freeze",
+    "override create NAME --replicas N": "scale",
+    "override create NAME --use-version VERSION": "pin",
+    "override create NAME --values FILE": "edit patch",
+    "reconcile CLUSTER": "sync",
+    "release DEMAND|APPLICATION": "cancel delete remove rm stop uninstall",
+    "revert COMMIT": "undo",
+    "rollback TIME": "restore rollout",
+    "suspend --application ID": "disable pause",
+    "undrain NODE": "uncordon",
+    "why NAME": "explain logs show trace tree",
 }
 
 # These commands run until they are stopped. They log or fill the screen, so they do not show the
@@ -170,8 +158,8 @@ def imported(name: str, module: str) -> ModuleType:
 
 
 def _hint(word: str) -> str:
-    if word in _LEADS:
-        return f"; did you mean: demandops {_LEADS[word]}"
+    if meant := next((lead for lead, words in _LEADS.items() if word in words.split()), ""):
+        return f"; did you mean: demandops {meant}"
     return suggestion(word, [*COMMANDS, *ALIASES]).replace("; known: ", "; the commands are: ")
 
 

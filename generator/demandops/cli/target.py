@@ -280,7 +280,9 @@ def names_of(*kinds: str) -> Callable[[click.Context, click.Parameter, str], lis
                 return []
             # offline, because a shell waits for the names while a person types
             with reader.opened_offline(address) as repo:
-                names = {name for kind in kinds for name in _names(repo, kind)} if repo else set()
+                names = (
+                    {name for kind in kinds for name in all_names(repo, kind)} if repo else set()
+                )
             return sorted(name for name in names if name.startswith(incomplete))
         except Exception:  # an error must not disturb a person who is typing
             return []
@@ -305,7 +307,7 @@ def name_options(helps: dict[str, str], **more: Any) -> Callable[[Command], Comm
     )
 
 
-def _names(repo: Reader, kind: str) -> Iterator[str]:
+def all_names(repo: Reader, kind: str) -> Iterator[str]:
     if kind == "proposals":
         yield from (proposal.branch for proposal in pending_proposals(repo.repository))
         return

@@ -124,6 +124,15 @@ class _Wake:
         return max(self.next_try, free)
 
 
+def _warn(cluster: str, why: str) -> None:
+    log.warning(
+        "cluster '%s' was not woken (%s); retrying for a minute; if no retry succeeds, "
+        "the cluster's controller fetches at its next interval",
+        cluster,
+        why,
+    )
+
+
 class ReconcileTrigger:
     # in a thread of its own; pushes that come before a call is due share it
     def __init__(
@@ -131,8 +140,10 @@ class ReconcileTrigger:
         clusters: Mapping[str, ClusterAccess],
         changes_since: ChangesSince,
         runtime: Runtime = REAL,
+        tell: Callable[[str, str], None] = _warn,  # of a cluster, and why it was not woken
     ) -> None:
         self._runtime = runtime
+        self._tell = tell
         self._changes_since = changes_since
         self._reported: dict[str, str] = {}
         self._clusters = {name: access for name, access in clusters.items() if access.wake}
@@ -157,6 +168,9 @@ class ReconcileTrigger:
         self._thread.join(2 * _TIMEOUT_S)
         for cache in self._caches.values():
             cache.close()
+
+    def not_woken(self) -> set[str]:
+        return {wake.cluster for wake in self._wakes.values() if wake.pushed is not None}
 
     def _run(self) -> None:
         while True:
@@ -232,12 +246,7 @@ class ReconcileTrigger:
             if wake.pause == _FIRST_RETRY_S:
                 # the texts of other errors may have URLs and secrets
                 is_ours = isinstance(error, NoAnswer | InvalidInput)
-                log.warning(
-                    "cluster '%s' was not woken (%s); retrying for a minute; if no retry succeeds, "
-                    "the cluster's controller fetches at its next interval",
-                    wake.cluster,
-                    str(error) if is_ours else type(error).__name__,
-                )
+                self._tell(wake.cluster, str(error) if is_ours else type(error).__name__)
             if wake.pause > _LONGEST_RETRY_S:
                 wake.pushed = None  # give up
             wake.next_try = self._runtime.monotonic() + wake.pause

@@ -124,8 +124,16 @@ class Agenda:
             seconds = (end - self._runtime.now()).total_seconds() + 0.01
             own_work = min(own_work, max(seconds, self.waits_s("end", name)))
         own_work = min([own_work, *(self.waits_s("drain", node) for node in _to_drain(state))])
+        first = state.ledger.first_to_end()
+        if first is not self._first_to_end:  # a search is slow if many leases end at one time
+            self._first_to_end, self._next_end = first, state.ledger.next_lease_end()
+        leases = LONGEST_WAIT_S
+        if self._next_end is not None:
+            # one that has ended may have a grace, or its release failed
+            seconds = (self._next_end - self._read_clocks()).total_seconds() + 0.01
+            leases = min(max(seconds, _SHORTEST_LOOK_S), LONGEST_WAIT_S)
         due: dict[What, float] = {
-            "leases": self._lease_ends_in(state.ledger),
+            "leases": leases,
             "own work": max(own_work, self.waits_s("own work")),
             "fetch": fetch,
             # after a failure, the remote is likely away
@@ -294,16 +302,6 @@ class Agenda:
             return True
         grace = max(_SHORTEST_GRACE_S, lease.slack + (lease.seconds if self._has_jumped else 0))
         return self._runtime.monotonic() <= self._steady_since + grace
-
-    def _lease_ends_in(self, ledger: Ledger) -> float:
-        first = ledger.first_to_end()
-        if first is not self._first_to_end:  # a search is slow if many leases end at one time
-            self._first_to_end, self._next_end = first, ledger.next_lease_end()
-        if self._next_end is None:
-            return LONGEST_WAIT_S
-        seconds = (self._next_end - self._read_clocks()).total_seconds() + 0.01
-        # one that has ended may have a grace, or its release failed
-        return min(max(seconds, _SHORTEST_LOOK_S), LONGEST_WAIT_S)
 
     def _read_clocks(self) -> datetime:
         now, steady = self._runtime.now(), self._runtime.monotonic()

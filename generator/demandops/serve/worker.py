@@ -182,7 +182,7 @@ class Worker:
         main = str(self.snapshot.commit) if self._approvals.proposals else ""
         return self._agenda.due_in(self.snapshot.state, main, has_news=has_news)
 
-    def _work(self) -> None:
+    def _work(self) -> None:  # noqa: PLR0912
         batch: list[Ticket] = []
         try:
             # demands before fetches: the push of a demand finds new commits just as a fetch would
@@ -201,37 +201,31 @@ class Worker:
                 self._repository.tidy()
             if self._approvals.proposals and not self._agenda.waits_s("all"):
                 self._check_proposals()
-        except Exception as error:
-            self._fail(
-                batch, access_error(error, self._repository.address, self._repository.objects)
-            )
+        except Exception as failure:
+            error = access_error(failure, self._repository.address, self._repository.objects)
+            if isinstance(error, errors.Unsound):
+                self._demands.end(error)  # the process must end; the next one reads the journal
+                raise error from failure
+            if isinstance(error, errors.ShuttingDown):
+                self._demands.fail(batch, error, keep=True)
+                return
+            # an expected error is in the answers to the demands, so only others are recorded
+            if not batch or not isinstance(error, DemandOpsError):
+                self._runtime.failed(_NAME, error)
+            if not batch:
+                # not at each failure in a row, because git then reads all objects
+                if self._agenda.failed("all", first=agenda.FIRST_PAUSE_S) == agenda.FIRST_PAUSE_S:
+                    try:
+                        self._repository.renew_if_damaged()
+                    except StateRepoError as damage:
+                        log.warning("%s", damage)
+                self._agenda.fetched(reached=False)
+            if not isinstance(error, DemandOpsError):
+                error = errors.internal(error)
+            self._demands.fail(batch, error)
         else:
             if not self._agenda.waits_s("all"):
                 self._runtime.recovered(_NAME)
-
-    def _fail(self, batch: list[Ticket], error: Exception) -> None:
-        if isinstance(
-            error, errors.Unsound
-        ):  # the process must end; the next one reads the journal
-            self._demands.end(error)
-            raise error
-        if isinstance(error, errors.ShuttingDown):
-            self._demands.fail(batch, error, keep=True)
-            return
-        # an expected error is in the answers to the demands, so only other errors are recorded
-        if not batch or not isinstance(error, DemandOpsError):
-            self._runtime.failed(_NAME, error)
-        if not batch:
-            # not at each failure in a row, because git then reads all objects
-            if self._agenda.failed("all", first=agenda.FIRST_PAUSE_S) == agenda.FIRST_PAUSE_S:
-                try:
-                    self._repository.renew_if_damaged()
-                except StateRepoError as damage:
-                    log.warning("%s", damage)
-            self._agenda.fetched(reached=False)
-        if not isinstance(error, DemandOpsError):
-            error = errors.internal(error)
-        self._demands.fail(batch, error)
 
     # ---- publishing demands ----
 

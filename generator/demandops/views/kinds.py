@@ -82,31 +82,30 @@ def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
 
     The newest commit that names a thing which is not there now is the one that ended it.
     """
-    kind, past = KINDS[name], list[Row]()
-    seen = {row.item["name"] for row in rows_of(source, name)}
+    kind, past = KINDS[name], dict[str, Json]()
+    present = {row.item["name"] for row in rows_of(source, name)}
     for number, entry in enumerate(source.reader().log(source.commit)):
         if number == MOST_COMMITS:
-            return past, entry.commit
+            return [*map(kind.row, past.values())], entry.commit
         trailers = entry.trailers
-        for gone in trailers.get(kind.trailer, ()):
-            if gone in seen:
-                continue
-            seen.add(gone)
-            item = {column.key: None for column in kind.columns} | {
-                "name": gone,
-                "state": "gone",
-                "requesters": trailers.get("Requester", []),
-                "applications": trailers.get("Application", []),
-                "connections": trailers.get("Connection", []),
-                "ended": {
-                    "time": time_data(entry.time),
-                    "by": entry.author,
-                    "operation": entry.first("Operation") or None,
-                    "commit": entry.commit,
-                },
+        named = trailers.get(kind.trailer, ())
+        for gone in (each for each in named if each not in present):
+            ended = {
+                "time": time_data(entry.time),
+                "by": entry.author,
+                "operation": entry.first("Operation") or None,
+                "commit": entry.commit,
             }
-            past.append(kind.row(item))
-    return past, ""
+            item: Json = {column.key: None for column in kind.columns}
+            item |= {"name": gone, "state": "gone", "ended": ended, "requesters": []}
+            item |= {"applications": [], "connections": []}
+            item = past.setdefault(gone, item)
+            item["since"] = time_data(entry.time)  # of the oldest commit that names it
+            if len(named) == 1 and not item["requesters"]:  # what a commit names is all of it
+                item["requesters"] = trailers.get("Requester", [])
+                item["applications"] = trailers.get("Application", [])
+                item["connections"] = trailers.get("Connection", [])
+    return [*map(kind.row, past.values())], ""
 
 
 # ---- columns that several lists have ----
@@ -367,8 +366,7 @@ def _requester(
         "connections": ids_of(claims, SubjectKind.CONNECTION),
         "releases": releases,
         "health": health,
-        # who else holds one of these demands
-        "requesters": list(requesters_of(claims)) or [name],
+        "requesters": [name],
     }
 
 

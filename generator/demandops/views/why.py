@@ -348,7 +348,6 @@ def _node(source: Source, thing: Thing) -> Json:
     claims.sort(key=lambda claim: (str(claim.subject), claim.demand))
     running = (release for release in source.releases.values() if release.node.id == thing.name)
     held = _held(source, claims, running)
-    state = "used" if held["releases"] or claims else "unused"
     what = "not in the inventory"
     if node:
         drained = ", drained" if node.drained else ""
@@ -356,7 +355,7 @@ def _node(source: Source, thing: Thing) -> Json:
         what += f"{domain.name if domain else 'none'}{drained}"
         listed = source.config.file_of(NODES_FILE, thing.name)
         held["shaped_by"] = [{"file": listed, "entry": thing.name, "what": what}]
-    return {**held, "state": state, "what": what}
+    return _used(held | {"what": what})
 
 
 def _is_unused(source: Source, node: str) -> bool:
@@ -384,40 +383,31 @@ def _appdef(source: Source, thing: Thing) -> Json:
     def is_held(claim: Claim) -> bool:
         return claim.is_on_application and claim.application.appdef == thing.name
 
-    what = source.config.appdefs[thing.name].description
-    answer = _held_where(source, what, is_held)
-    return answer | {"state": "used" if answer["claims"] else "unused"}
+    return _used(_held_where(source, source.config.appdefs[thing.name].description, is_held))
 
 
 def _domain(source: Source, thing: Thing) -> Json:
     domain, of_node = source.config.domains[thing.name], source.config.domain_of
     nodes = sorted(id for id, each in of_node.items() if each.name == thing.name)
-    claims = [
-        claim
-        for claim in source.state.ledger
-        if (home := of_node.get(claim.held.home)) and home.name == thing.name
-    ]
-    running = (r for r in source.releases.values() if r.domain.name == thing.name)
-    held = _held(source, by_booking(claims), running)
     approval = ", approval required" if domain.approval == "required" else ""
-    return {
-        **held,
-        "state": "used" if held["releases"] or claims else "unused",
-        "what": f"namespace {domain.namespace}, {len(nodes)} nodes{approval}",
-        "nodes": nodes,
-    }
+    what = f"namespace {domain.namespace}, {len(nodes)} nodes{approval}"
+    answer = _held_where(source, what, lambda claim: claim.held.home in nodes)
+    return _used(answer | {"nodes": nodes})
 
 
 def _service(source: Source, thing: Thing) -> Json:
-    running = {
-        name: release
-        for name, release in source.releases.items()
+    running = [
+        release
+        for release in source.releases.values()
         if isinstance(release, ServiceRelease) and release.key.service == thing.name
-    }
-    claims = {id(c): c for name in running for c in source.claims_of_releases[name]}
-    held = _held(source, by_booking(claims.values()), running.values())
-    state = "used" if running else "unused"
-    return {**held, "state": state, "what": f"a service of {thing.path}"}
+    ]
+    claims = {id(c): c for each in running for c in source.claims_of_releases[each.name]}
+    held = _held(source, by_booking(claims.values()), running)
+    return _used(held | {"what": f"a service of {thing.path}"})
+
+
+def _used(answer: Json) -> Json:
+    return answer | {"state": "used" if answer["claims"] or answer["releases"] else "unused"}
 
 
 _EXPLAINED: dict[str, Callable[[Source, Thing], Json]] = {

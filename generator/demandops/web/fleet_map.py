@@ -150,7 +150,7 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
             if is_lit:
                 lit.update(ends)
                 lit_releases.update(row.item["releases"])
-    for row in rows_of(source, "services") if wanted else ():
+    for row in rows_of(source, "releases") if wanted else ():
         if wanted.matches(row):
             lit.add(row.item["node"])
             lit_releases.add(row.item["name"])
@@ -168,9 +168,12 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     chosen = set[str]()
     for node in nodes if wanted else ():
         texts = {"node": [node.id], "type": [node.type], "cluster": [node.cluster]}
-        texts["peer"] = sorted(peers[node.id]) or ["none"]
-        texts["cell"] = [_cell(spots[node.id])] if node.id in spots else []
-        if wanted.matches(Row(texts)):
+        around = {"peer": sorted(peers[node.id]) or ["none"]}
+        around["cell"] = [_cell(spots[node.id])] if node.id in spots else []
+        # a stack's filter names what is around its nodes; a word alone does not look there
+        if wanted.matches(Row(texts | around)) and (
+            wanted.matches(Row(texts)) or not wanted.matches(Row(around))
+        ):
             chosen.add(node.id)
     lit = (lit | chosen) & known.keys()
 

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import groupby
 
-from demandops.cluster.release_status import ReleaseStatus
-from demandops.model.ledger.claim import Claim, requesters_of
-from demandops.model.release import ServiceRelease
 from demandops.views.causes import Cause
 from demandops.views.kinds import rows_of
 from demandops.views.rows import TONES, Filter, Row, exactly
-from demandops.views.source import RANKS, Source, worst_word
+from demandops.views.source import RANKS, Source
 from demandops.web.lists import Part
 from demandops.web.time_line import BOOKED, RELEASED, Event
 
@@ -34,17 +31,17 @@ def figures(source: Source, wanted: Filter, events: Iterable[Event], now: dateti
     def matching(name: str) -> list[Row]:
         return [row for row in rows_of(source, name) if wanted.matches(row)]
 
-    def of_list(rows: list[Row], what: str, view: str) -> Figure:
+    def of_list(name: str) -> Figure:
+        rows = matching(name)
         counts = Counter(row.item["health"] or "unknown" for row in rows)
         words = [
-            (Part(f"{count} {word}", view, {"q": exactly("health", word)}), TONES[word])
+            (Part(f"{count} {word}", name, {"q": exactly("health", word)}), TONES[word])
             for word, count in sorted(counts.items(), key=lambda pair: RANKS[pair[0]])
         ]
-        return Figure(len(rows), Part(_counted(len(rows), what), view), words)
+        return Figure(len(rows), Part(_counted(len(rows), name), name), words)
 
-    services, connections, demands = map(matching, ("services", "connections", "demands"))
-    requesters = {who for row in demands for who in row.item["requesters"]}
-    nodes = {id for row in demands for id in row.item["nodes"]} & source.config.nodes.keys()
+    used = [row for row in matching("nodes") if row.item["demands"] and row.item["type"]]
+    demands = matching("demands")
     waiting = [row for row in demands if row.item["state"] == "waiting"]
     waits = [
         (count, (Part(f"{count} for {what}", view, params), "busy"))
@@ -62,14 +59,8 @@ def figures(source: Source, wanted: Filter, events: Iterable[Event], now: dateti
         return Part(f"{booked} booked, {released} released in the last {span}"), ""
 
     return [
-        of_list(services, "service", "services"),
-        of_list(connections, "connection", "connections"),
-        of_list(demands, "demand", "demands"),
-        Figure(
-            len(requesters),
-            Part(_counted(len(requesters), "requester"), "requesters"),
-        ),
-        Figure(len(nodes), Part(f"of {len(source.config.nodes)} nodes used", "map")),
+        *map(of_list, ("releases", "connections", "demands", "requesters")),
+        Figure(len(used), Part(f"of {len(source.config.nodes)} nodes used", "nodes")),
         Figure(
             sum(count for count, _ in waits),
             Part("waiting", "proposals"),
@@ -78,15 +69,17 @@ def figures(source: Source, wanted: Filter, events: Iterable[Event], now: dateti
         Figure(
             len(last_hour),
             Part(
-                f"{_counted(len(last_hour), 'change')} in the last hour", "timeline", {"span": "1h"}
+                f"{_counted(len(last_hour), 'changes')} in the last hour",
+                "timeline",
+                {"span": "1h"},
             ),
             [rate(last_hour, "hour"), rate(last_day, "day")],
         ),
     ]
 
 
-def _counted(count: int, word: str) -> str:
-    return word if count == 1 else f"{word}s"
+def _counted(count: int, words: str) -> str:
+    return words.removesuffix("s") if count == 1 else words
 
 
 def newest(events: Sequence[Event]) -> Iterator[tuple[Event, int]]:
@@ -101,36 +94,24 @@ def link_of(cause: Cause) -> Part:
     if kind:
         return Part(cause.what, "thing", {"kind": kind, "name": name})
     query = f"{exactly('cluster', cause.cluster)} {exactly('health', cause.kind)}"
-    return Part(cause.what, "services", {"q": query}) if cause.releases else Part(cause.what)
+    return Part(cause.what, "releases", {"q": query}) if cause.releases else Part(cause.what)
 
 
-@dataclass(frozen=True, slots=True)
-class Ready:
-    application: str
-    word: str  # for a health, or the kind of the first cause
-    is_ready: bool
+def applications(
+    source: Source, causes: Iterable[Cause], wanted: Filter
+) -> list[tuple[str, str, Cause | None]]:
+    """Return each application with a word for its health and its worst cause; unready ones first.
 
-
-def applications(source: Source, causes: Iterable[Cause], wanted: Filter) -> list[Ready]:
-    first_causes: dict[str, Cause] = {}
+    What runs well may still be denied or invalid. Then the kind of the cause says more.
+    """
+    worst: dict[str, Cause] = {}
     for cause in causes:
-        for application in cause.applications:
-            first_causes.setdefault(application, cause)
-    statuses = defaultdict[str, list[ReleaseStatus]](list)
-    claims_of = defaultdict[str, list[Claim]](list)
-    for name, release in source.releases.items():
-        for application in release.applications if isinstance(release, ServiceRelease) else ():
-            statuses[application].append(source.status(name))
-    for claim in source.state.ledger:
-        if claim.is_on_application:
-            claims_of[claim.subject.id].append(claim)
+        for name in cause.applications:
+            worst.setdefault(name, cause)
     shown = []
-    for application, claims in sorted(claims_of.items()):
-        texts = {"requester": requesters_of(claims), "demand": [claim.demand for claim in claims]}
-        if wanted.matches(Row(texts | {"application": [application]})):
-            word, first = worst_word(statuses[application]), first_causes.get(application)
-            # what runs well may still be denied or invalid; then the cause says more
-            if first and word in ("healthy", "unknown"):
-                word = first.kind
-            shown.append(Ready(application, word, first is None))
-    return sorted(shown, key=lambda ready: (ready.is_ready, ready.application))
+    for row in filter(wanted.matches, rows_of(source, "applications")):
+        name, word = row.item["name"], row.item["health"] or "unknown"
+        first = worst.get(name)
+        is_said = word not in ("healthy", "unknown")
+        shown.append((name, first.kind if first and not is_said else word, first))
+    return sorted(shown, key=lambda each: (each[2] is None, each[0]))

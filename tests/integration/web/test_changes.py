@@ -225,10 +225,10 @@ def test_the_overview_has_the_fleet_in_figures(
         return look("/", **asked).texts("li")[:7]
 
     assert figures() == [
-        "3 services 3 unknown",
+        "9 releases 9 unknown",
         "3 connections 3 unknown",
         "2 demands 2 unknown",
-        "3 requesters",
+        "3 requesters 3 unknown",
         "4 of 7 nodes used",
         "0 waiting",
         "2 changes in the last hour 2 booked, 0 released in the last hour "
@@ -238,7 +238,7 @@ def test_the_overview_has_the_fleet_in_figures(
     person.override(roadworks=DENY)
     overridden(booked)
     told = figures(q="vehicle01")
-    assert told[1:4] == ["1 connection 1 unknown", "1 demand 1 unknown", "2 requesters"]
+    assert told[1:3] == ["1 connection 1 unknown", "1 demand 1 unknown"]
     assert "1 booked, 0 released in the last day" in told[-1]
     assert "1 booked, 1 released" not in told[-1] and "1 released in the last day" in figures()[-1]
     page = look("/")

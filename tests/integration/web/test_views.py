@@ -215,6 +215,9 @@ def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:
     on_edge = {mark.text: mark.is_lit for card in lit for mark in card.marks}
     assert on_edge["object-detection · station00"] and on_edge["mqtt vehicle01/edge"]
     assert not on_edge["object-detection · vehicle00"]
+    # a line to each that matches, and none to the other vehicles of the edge
+    found, _ = fleet_map.picture(now, Filter("vehicle01"), "")["drawings"]
+    assert not [line.title for line in found.lines if "vehicle00" in line.title.split(":")[0]]
 
 
 def fleet_of(follower: Follower, vehicles: int, edges: int = 1) -> Source:

@@ -19,6 +19,7 @@ from demandops.cluster.health import REQUESTED_AT
 from demandops.cluster.reconcile_trigger import ReconcileTrigger, _Wake, signature, web_address
 
 from tests.kit import plain_yaml
+from tests.kit.cli import Run
 from tests.kit.generator import wait_until
 from tests.kit.golden import start
 from tests.kit.http import Answer, Call, Server, kubeconfig, serving
@@ -240,6 +241,25 @@ def test_a_receiver_of_flux_is_called_with_the_signature_that_github_documents(
     trigger("experiment", ClusterAccess(receiver=hook.url, secret_file=secret_file))
     call = hook.calls[0]
     assert call.headers["X-Signature"] == signature(SECRET.encode(), call.body)
+
+
+def test_a_person_wakes_a_cluster_by_name(
+    hook: Server, secret_file: Path, tmp_path: Path, demandops: Run
+) -> None:
+    assert demandops("init", tmp_path / "fleet.git", "--bare").code == 0
+    file = tmp_path / "clusters.yaml"
+    access = f"receiver: {hook.url}, secret_file: {secret_file}, wake: false"
+    file.write_text(f"{HEAD}clusters: {{c-its: {{{access}}}, away: {{webhook: {hook.url}}}}}\n")
+    where = ("--clusters", file, "--state-repo", tmp_path / "fleet.git")
+    assert demandops("reconcile", "c-its", *where).out == "c-its is woken\n"
+    assert hook.calls[0].headers["X-Signature"] == signature(SECRET.encode(), hook.calls[0].body)
+    failed = demandops("reconcile", "away", *where)
+    assert (failed.code, failed.err) == (
+        1,
+        "error: cluster 'away' was not woken: it has neither a kubeconfig nor a receiver\n",
+    )
+    assert "has no cluster 'c-it'; did you mean" in demandops("reconcile", "c-it", *where).err
+    assert demandops("reconcile", *where).code == 2
 
 
 def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file: Path) -> None:

@@ -14,7 +14,7 @@ from demandops.cli.changes.person_change import warned_if_unnamed
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import done, errors
 from demandops.cli.queries.diff import differences, entry_lines, release_lines
-from demandops.cli.target import names_of, signing_option, writable_repo_option
+from demandops.cli.target import names_of, signing_option, with_options, writable_repo_option
 from demandops.repo.git.repository import PushDenied
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
@@ -29,12 +29,21 @@ from demandops.repo.write.proposal_branch import (
 
 # ---- ``demandops approve``: merge a proposal in the caller's own name ----
 
-commit_option = click.option(
-    "--commit",
-    metavar="ID",
-    default="",
-    help="The whole id of the commit that you looked at. If the branch is at another commit, "
-    "nothing is changed.",
+# what both commands take
+_answering = with_options(
+    click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals")),
+    person_change.reason_option,
+    click.option(
+        "--commit",
+        metavar="ID",
+        default="",
+        help="The whole id of the commit that you looked at. If the branch is at another commit, "
+        "nothing is changed.",
+    ),
+    person_change.yes_option,
+    writable_repo_option,
+    signing_option,
+    output_option,
 )
 
 
@@ -70,13 +79,7 @@ def _proposal(repo: Reader, name: str, commit: str, output: str) -> PendingPropo
 
 
 @click.command()
-@click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals"))
-@person_change.reason_option
-@commit_option
-@person_change.yes_option
-@writable_repo_option
-@signing_option
-@output_option
+@_answering
 def approve(
     name: str,
     reason: str,
@@ -132,13 +135,7 @@ def approve(
 
 
 @click.command()
-@click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals"))
-@person_change.reason_option
-@commit_option
-@person_change.yes_option
-@writable_repo_option
-@signing_option
-@output_option
+@_answering
 def reject(
     name: str,
     reason: str,

@@ -24,6 +24,7 @@ from demandops.cli.changes.person_change import (
 )
 from demandops.cli.json_output import show
 from demandops.cli.output import busy, done, errors, fitted, progress, terminal_width
+from demandops.cli.queries.diff import resolved
 from demandops.cli.target import names_of
 from demandops.decide.decision import decide
 from demandops.decide.state import State
@@ -306,7 +307,7 @@ def rollback(
 
     def goal_of(repo: Reader, state: State) -> Goal:
         nonlocal to, since
-        to = repo.commit(revision)
+        to = resolved(repo, revision)
         since = repo.changed_files(to, repo.commit(), CONFIG_ROOTS)
         named = {"demand": demand and _meant(demand, ["demand"], state), "application": application}
         only = {key: id for key, id in named.items() if id}

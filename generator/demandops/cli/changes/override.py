@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from datetime import timedelta
 from typing import Any
 
 import click
 
 from demandops.base import naming, strict_yaml
-from demandops.base.errors import Fault, InvalidInput, fault, suggestion
-from demandops.base.naming import SubjectKind, id_problem
+from demandops.base.errors import InvalidInput, fault, suggestion
+from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
@@ -18,23 +18,22 @@ from demandops.cli import target
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import Options, changing, propose_option, writable
 from demandops.cli.output import read_by
-from demandops.cli.target import names_of
-from demandops.decide.state import State
+from demandops.cli.target import all_names, names_of
 from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.config.policy import matches
-from demandops.repo.reader import Reader
 from demandops.views.vocabulary import Json, override_data
 
 # ---- what the commands share: their options and selection ----
 
 editing = changing(propose_option)
 
+_SELECTED = ("application", "appdef", "service", "connection", "node", "requester")
 selecting = target.name_options(
     {
         name: f"Select this {name}; * matches any text, ? one character. May be repeated."
-        for name in ("application", "appdef", "service", "connection", "node", "requester")
+        for name in _SELECTED
     },
     metavar="NAME",
     multiple=True,
@@ -43,18 +42,6 @@ selecting = target.name_options(
 
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
     return {name: list(values) for name, values in given.items() if values}
-
-
-effect_options = target.with_options(
-    click.option("--hold", is_flag=True, help="Keep the rendered files as they are."),
-    click.option("--deny", is_flag=True, help="Refuse demands, and stop what runs."),
-    click.option(
-        "--keep", is_flag=True, help="Keep services running after their last demand ends."
-    ),
-    click.option(
-        "--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas."
-    ),
-)
 
 
 def ends_at(text: str | None) -> str | None:
@@ -120,7 +107,10 @@ def _image(ctx: click.Context, param: click.Parameter, given: tuple[str, ...]) -
 @override.command()
 @click.argument("name", metavar="NAME", callback=_new_name)
 @selecting
-@effect_options
+@click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
+@click.option("--deny", is_flag=True, help="Refuse demands, and stop what runs.")
+@click.option("--keep", is_flag=True, help="Keep services running after their last demand ends.")
+@click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas.")
 @click.option(
     "--refuse-new",
     "refuseNew",
@@ -174,7 +164,7 @@ def create(name: str, values: str | None, options: Options, **given: Any) -> Non
         patch = strict_yaml.load(content, file)
         if not isinstance(patch, dict):
             raise InvalidInput.at("", "must be a mapping of Helm values", file=file)
-    selected = {kind: given.pop(kind) for kind in _KNOWN}
+    selected = {f"{name}s": given.pop(f"{name}s") for name in _SELECTED}
     # a flag that is not given is no effect
     more = {field: value for field, value in given.items() if value is not False}
     _create(name, f"Create override {name}", selected, {"values": patch, **more}, options)
@@ -210,7 +200,18 @@ def _create(
         if repo.file_reader()(_path_of(name)) is not None:
             message = "exists already; end it first, or choose another name"
             raise InvalidInput.at("", message, file=_path_of(name))
-        if unknown := list(_unknown(repo.snapshot().state, chosen, bool(fields.get("refuseNew")))):
+        unknown = []
+        for kind, patterns in chosen.items():
+            # only a freeze can be about what nobody demands yet
+            is_open = kind in ("applications", "connections", "requesters")
+            names = [*all_names(repo, kind)]
+            for pattern in patterns if not (is_open and fields.get("refuseNew")) else ():
+                if not any(matches(name, (pattern,)) for name in names):
+                    what = kind.removesuffix("s")
+                    hint = "; only --refuse-new can be about what nobody demands yet"
+                    message = f"no {what} is called {quoted(pattern)}{suggestion(pattern, names)}"
+                    unknown.append(fault(f"--{what}", message + (hint if is_open else "")))
+        if unknown:
             raise InvalidInput(unknown)
         # a name in git may have characters that an owner may not have
         person = repo.operator()
@@ -220,33 +221,10 @@ def _create(
         }
         text = override_text(name, {**given, "select": [chosen]})
         parsed = Override.from_file(name, parse_file(OverrideFile, text, _path_of(name)))
-        _carry_out(repo, parsed, text, summary, options)
-
-
-# The names that a selection may mean, by the field of the selector.
-_KNOWN: dict[str, Callable[[State], Iterable[str]]] = {
-    "applications": lambda state: state.ledger.subjects(SubjectKind.APPLICATION),
-    "appdefs": lambda state: state.config.appdefs,
-    "services": lambda state: {n for own in state.config.services.values() for n in own},
-    "connections": lambda state: state.ledger.subjects(SubjectKind.CONNECTION),
-    "nodes": lambda state: state.config.nodes,
-    "requesters": lambda state: state.ledger.indexed_names("requester"),
-}
-_FREE = ("applications", "connections", "requesters")  # names that demands choose
-
-
-def _unknown(state: State, chosen: Mapping[str, list[str]], is_freeze: bool) -> Iterator[Fault]:
-    for kind, patterns in chosen.items():
-        if is_freeze and kind in _FREE:  # it is about what nobody demands yet
-            continue
-        names = list(_KNOWN[kind](state))
-        for pattern in patterns:
-            if not any(matches(name, (pattern,)) for name in names):
-                hint = suggestion(pattern, names)
-                if kind in _FREE:
-                    hint += "; only --refuse-new can be about what nobody demands yet"
-                message = f"no {kind.removesuffix('s')} is called {quoted(pattern)}{hint}"
-                yield fault(f"--{kind.removesuffix('s')}", message)
+        note = "  refuses what is new; what runs may be renewed, reduced and released"
+        more = {"override": override_data(parsed)}, [note] if parsed.refuseNew else []
+        files, branch = {parsed.path: text}, f"override/{name}"
+        person_change.commit(repo, files, summary, branch, options, lambda *_: more)
 
 
 def _path_of(name: str) -> str:
@@ -274,21 +252,9 @@ def _end(
         if selected and not selects(override, selected):
             message = f"selects something else; to end it, run: demandops resume {name}"
             raise InvalidInput.at("select", message, file=_path_of(name))
-        _carry_out(repo, override, None, summary, options)
-
-
-def _carry_out(
-    repo: Reader, override: Override, text: str | None, summary: str, options: Options
-) -> None:
-    # without a text, the override's file is removed
-    def more(before: State, after: State) -> tuple[Json, list[str]]:
-        lines = []
-        if override.refuseNew and text is not None:
-            lines.append("  refuses what is new; what runs may be renewed, reduced and released")
-        return {"override": override_data(override)}, lines
-
-    files, branch = {override.path: text}, f"override/{override.name}"
-    person_change.commit(repo, files, summary, branch, options, more)
+        files, more = {override.path: None}, {"override": override_data(override)}
+        branch = f"override/{name}"
+        person_change.commit(repo, files, summary, branch, options, lambda *_: (more, ()))
 
 
 # ---- ``demandops suspend``: an override that denies applications and connections ----

@@ -188,7 +188,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
     show_default=True,
     help="List at most this many of the commits that changed the object.",
 )
-@json_output.output_option
+@json_output.output_formats("text", "json", "yaml", "jsonpath=…")
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:

@@ -200,10 +200,14 @@ class NewObjects(pygit2.OdbBackend):
                 pack = write_pack(folder, objects)
                 keep = self._packs / f"{pack.stem}.keep"
                 # git removes no pack that has such a file; a link to what is synced costs no sync
+                keep.unlink(missing_ok=True)
                 try:
                     keep.hardlink_to(pack.with_suffix(".idx"))
                 except OSError:  # the file system has no hard links, or the disk no room
-                    keep.write_bytes(_KEEP)
+                    # never into a file that exists: it may be a link to the index of a pack
+                    unplaced = pack.with_suffix(".keep")
+                    unplaced.write_bytes(_KEEP)
+                    unplaced.replace(keep)
                 # the pack comes first, because git removes an index without a pack
                 for file in (pack, pack.with_suffix(".idx")):
                     file.replace(self._packs / file.name)

@@ -194,7 +194,17 @@ class RemoteRepository(StateRepository):
         # only this process uses the folder, so a killed process left these locks
         for lock in folder.rglob("*.lock"):
             lock.unlink(missing_ok=True)
-        if not self._is_usable():
+        try:
+            found = Repository(str(folder))
+            commit = found[found.references[_REMOTE_MAIN].target]
+            is_usable = isinstance(commit, pygit2.Commit) and bool(commit.tree.id)
+            # git needs more of the files than libgit2, so check HEAD too
+            head = (folder / "HEAD").read_text()
+            is_usable = is_usable and re.fullmatch(r"ref: refs/heads/\w+\n", head) is not None
+            is_usable = is_usable and found.config["remote.origin.url"] == url
+        except Exception:  # whatever the damage, a new clone repairs it
+            is_usable = False
+        if not is_usable:
             self._clone()
         self._open()
         try:
@@ -211,18 +221,6 @@ class RemoteRepository(StateRepository):
             raise self._unreadable() from None
         self.new = NewObjects(self.objects)
         self.new.clean()
-
-    def _is_usable(self) -> bool:
-        try:
-            repo = Repository(str(self._folder))
-            commit = repo[repo.references[_REMOTE_MAIN].target]
-            is_whole = isinstance(commit, pygit2.Commit) and bool(commit.tree.id)
-            # git needs more of the files than libgit2, so check HEAD too
-            head = (self._folder / "HEAD").read_text()
-            is_whole = is_whole and re.fullmatch(r"ref: refs/heads/\w+\n", head) is not None
-            return is_whole and repo.config["remote.origin.url"] == self._url
-        except Exception:  # whatever the damage, a new clone repairs it
-            return False
 
     def renew_if_damaged(self) -> bool:
         checked = self._run_git("fsck", "--no-dangling", "--no-progress")

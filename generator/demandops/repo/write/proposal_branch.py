@@ -33,7 +33,7 @@ log = logging.getLogger("demandops")
 
 PREFIX = "demand/"
 # where people propose; a command that proposes something else adds its folder here
-OF_PEOPLE = ("override/", "drain/", "change/")
+OF_PEOPLE = ("override/", "drain/", "undrain/", "revert/")
 _PREFIXES = (PREFIX, *OF_PEOPLE)
 _HEADS = "refs/heads/"
 _NO_OPTIONS = re.compile(r"^fatal: the receiving end does not support push options", re.MULTILINE)
