@@ -26,7 +26,7 @@ from tests.benchmarks import fleet
 from tests.kit.browser import Visit, chromium
 
 VIEWS = ["", "map", "map?q=edge00000"]
-VIEWS += ["demands", "services", "connections", "timeline", "overrides"]
+VIEWS += ["demands", "releases", "connections", "nodes", "timeline", "overrides"]
 RELEASES = 10_000
 AIM_MS = 200
 ROUNDS = 3

@@ -99,6 +99,51 @@ def test_watch_prints_the_list_again_when_it_changes(on: On, fleet: GitRepo) -> 
     assert (second["items"], second["commit"]) == ([], fleet.tip)
 
 
+@pytest.mark.parametrize(
+    ("template", "told"),
+    [
+        ("{.items[*].name}", "vehicle00 vehicle01"),
+        ("{.items[0]['requesters'][0]} {.kind}", "vehicle00 requesters"),
+        ('{range .items[*]}{.name}{"\\n"}{end}', "vehicle00\nvehicle01\n"),
+        (".items[-1].name", "vehicle01"),
+    ],
+)
+def test_a_template_picks_from_the_json(on: On, template: str, told: str) -> None:
+    selected = ("get", "requesters", "-l", "requester=vehicle*")
+    assert on(*selected, "-o", f"jsonpath={template}").out == f"{told}\n"
+
+
+@pytest.mark.parametrize("template", ["{.items[*].nmae}", "{range .items[*]}", "{.items[}"])
+def test_a_template_that_picks_nothing_is_refused(on: On, template: str) -> None:
+    ran = on("get", "nodes", "-o", f"jsonpath={template}")
+    assert (ran.code, ran.out) == (2, "")
+    assert "--output: " in ran.err
+
+
+def test_lists_are_selected_by_any_label_and_sorted_by_any_column(on: On) -> None:
+    def names(*options: str) -> list[str]:
+        return on("get", "nodes", "-o", "name", *options).out.split()
+
+    assert names("-l", "type=vehicle,state=open", "--sort-by", "-name")[-1] == "vehicle00"
+    assert names("-l", "requester=vehicle00", "-l", "type=edge") == ["edge"]
+    assert names("--sort-by", "type")[0] == "cloud"
+    ran = on("get", "nodes", "-l", "colour=red")
+    assert ran.code == 2 and "nodes have no colour; they have " in ran.err
+    assert on("get", "nodes", "-l", "type=vehcle").err.count("did you mean 'vehicle'") == 1
+    assert on("get", "nodes", "--sort-by", "age").code == 2
+
+
+def test_what_is_gone_has_its_past(on: On, fleet: GitRepo) -> None:
+    assert on("decommission", "vehicle00", "--yes").code == 0
+    (item,) = on.json("get", "demands", "patrol", "--gone")["items"]
+    assert (item["state"], item["connections"]) == ("gone", ["patrol/link"])
+    assert (item["ended"]["operation"], item["ended"]["commit"]) == ("decommission", fleet.tip)
+    assert " ago by " in on("get", "demands", "patrol", "--gone").out
+    assert "vehicle00" in on("get", "requesters", "--gone", "-o", "name").out.split()
+    assert on("get", "demands", "--gone", "vehicle09").code == 1
+    assert on("get", "nodes", "--gone").code == 2
+
+
 class TestStatus:
     @pytest.fixture
     def access(self, tmp_path: Path) -> Callable[[str], tuple[str, Path]]:

@@ -24,7 +24,7 @@ from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.views import vocabulary
-from demandops.views.rows import Column, Row, labels_of
+from demandops.views.rows import Column, Row, TextsOf, labels_of
 from demandops.views.source import Source, since_of, word_of, worst_word
 from demandops.views.vocabulary import Json, claim_data, lease_data, subject_text, time_data
 
@@ -82,31 +82,30 @@ def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
 
     The newest commit that names a thing which is not there now is the one that ended it.
     """
-    kind, past = KINDS[name], list[Row]()
-    seen = {row.item["name"] for row in rows_of(source, name)}
+    kind, past = KINDS[name], dict[str, Json]()
+    present = {row.item["name"] for row in rows_of(source, name)}
     for number, entry in enumerate(source.reader().log(source.commit)):
         if number == MOST_COMMITS:
-            return past, entry.commit
+            return [*map(kind.row, past.values())], entry.commit
         trailers = entry.trailers
-        for gone in trailers.get(kind.trailer, ()):
-            if gone in seen:
-                continue
-            seen.add(gone)
-            item = {column.key: None for column in kind.columns} | {
-                "name": gone,
-                "state": "gone",
-                "requesters": trailers.get("Requester", []),
-                "applications": trailers.get("Application", []),
-                "connections": trailers.get("Connection", []),
-                "ended": {
-                    "time": time_data(entry.time),
-                    "by": entry.author,
-                    "operation": entry.first("Operation") or None,
-                    "commit": entry.commit,
-                },
+        named = trailers.get(kind.trailer, ())
+        for gone in (each for each in named if each not in present):
+            ended = {
+                "time": time_data(entry.time),
+                "by": entry.author,
+                "operation": entry.first("Operation") or None,
+                "commit": entry.commit,
             }
-            past.append(kind.row(item))
-    return past, ""
+            item: Json = {column.key: None for column in kind.columns}
+            item |= {"name": gone, "state": "gone", "ended": ended, "requesters": []}
+            item |= {"applications": [], "connections": []}
+            item = past.setdefault(gone, item)
+            item["since"] = time_data(entry.time)  # of the oldest commit that names it
+            if len(named) == 1 and not item["requesters"]:  # what a commit names is all of it
+                item["requesters"] = trailers.get("Requester", [])
+                item["applications"] = trailers.get("Application", [])
+                item["connections"] = trailers.get("Connection", [])
+    return [*map(kind.row, past.values())], ""
 
 
 # ---- columns that several lists have ----
@@ -141,8 +140,8 @@ LEASE = Column("lease", "Lease", 5, texts_of=_lease_text)
 ENDED = Column("ended", "Ended", 3, texts_of=_ended)
 
 
-def _names(key: str, title: str, rank: int, links: str = "", *, wide: bool = False) -> Column:
-    return Column(key, title, rank, links=links, only_wide=wide)
+def _wide(key: str, title: str, links: str = "", texts_of: TextsOf | None = None) -> Column:
+    return Column(key, title, 9, texts_of=texts_of, links=links, only_wide=True)
 
 
 def _command(title: str, words_of: Callable[[Json], list[str]]) -> Column:
@@ -324,6 +323,18 @@ def _claim(source: Source, claim: Claim, state: str) -> Json:
     return {"name": data["file"], **_held(source, [claim], state), **data}
 
 
+def _subject(item: Json, now: datetime) -> list[str]:
+    return [subject_text(item), *(f"held for {id}" for id in item["held_for"])]
+
+
+def _ends(item: Json, now: datetime) -> str:
+    return _lease_text(item, now).removeprefix("ends ")
+
+
+def _term(item: Json, now: datetime) -> str:
+    return duration_text(item["lease"]["seconds"])
+
+
 def _requesters(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     claims_of: defaultdict[str, list[Claim]] = defaultdict(list)
     waiting: defaultdict[str, list[str]] = defaultdict(list)
@@ -367,8 +378,7 @@ def _requester(
         "connections": ids_of(claims, SubjectKind.CONNECTION),
         "releases": releases,
         "health": health,
-        # who else holds one of these demands
-        "requesters": list(requesters_of(claims)) or [name],
+        "requesters": [name],
     }
 
 
@@ -459,6 +469,18 @@ def _asked_topics(topics: dict[str, list[str]], item: Json) -> list[str]:
     ]
 
 
+def _topics(item: Json, now: datetime) -> list[str]:
+    return _asked_topics(carried_topics(item), item)
+
+
+def _inputs(item: Json, now: datetime) -> list[str]:
+    return [text for topics in item["inputs"].values() for text in _asked_topics(topics, item)]
+
+
+def _parameters(item: Json, now: datetime) -> list[str]:
+    return [f"{name} = {value}" for name, value in item["parameters"].items()]
+
+
 def version_texts(item: Json, *_: object) -> list[str]:
     # of what `vocabulary.version_data` returns
     asked = item["versions_asked"].items()
@@ -511,6 +533,10 @@ def _node(
         "requesters": list(requesters_of(claims)),
         "health": health,
     }
+
+
+def _properties(item: Json, now: datetime) -> list[str]:
+    return [f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()]
 
 
 def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -637,9 +663,9 @@ KINDS: dict[str, Kind] = {
                 HOLDS,
                 LEASE,
                 SINCE,
-                _names("requests", "Requests", 9, wide=True),
-                _names("nodes", "Nodes", 9, "node", wide=True),
-                _names("suspended_by", "Suspended by", 9, wide=True),
+                _wide("requests", "Requests"),
+                _wide("nodes", "Nodes", "node"),
+                _wide("suspended_by", "Suspended by"),
             ),
             _demands,
             _demand,
@@ -658,8 +684,8 @@ KINDS: dict[str, Kind] = {
                 REQUESTERS,
                 Column("version", "Version", 7),
                 SINCE,
-                _names("demands", "Demands", 9, "demand", wide=True),
-                _names("releases", "Releases", 9, "release", wide=True),
+                _wide("demands", "Demands", "demand"),
+                _wide("releases", "Releases", "release"),
             ),
             _applications,
             _application,
@@ -701,26 +727,8 @@ KINDS: dict[str, Kind] = {
                 ),
                 _VERSION,
                 _CLUSTER,
-                Column(
-                    "inputs",
-                    "Takes in",
-                    9,
-                    texts_of=lambda item, now: [
-                        text
-                        for topics in item["inputs"].values()
-                        for text in _asked_topics(topics, item)
-                    ],
-                    only_wide=True,
-                ),
-                Column(
-                    "parameters",
-                    "Parameters",
-                    9,
-                    texts_of=lambda item, now: [
-                        f"{n} = {v}" for n, v in item["parameters"].items()
-                    ],
-                    only_wide=True,
-                ),
+                _wide("inputs", "Takes in", texts_of=_inputs),
+                _wide("parameters", "Parameters", texts_of=_parameters),
             ),
             _services,
             _release,
@@ -736,13 +744,8 @@ KINDS: dict[str, Kind] = {
                 Column("source", "From", 2, links="node"),
                 Column("target", "To", 2, links="node"),
                 REQUESTERS,
-                Column(
-                    "topics",
-                    "Topics",
-                    5,
-                    texts_of=lambda item, now: _asked_topics(carried_topics(item), item),
-                ),
-                _names("releases", "Releases", 9, "release", wide=True),
+                Column("topics", "Topics", 5, texts_of=_topics),
+                _wide("releases", "Releases", "release"),
             ),
             _connections,
             _connection,
@@ -758,19 +761,9 @@ KINDS: dict[str, Kind] = {
             "Demands that end unless their requester renews them. The first to end comes first.",
             (
                 Column("name", "Demand", links="demand"),
-                Column(
-                    "lease",
-                    "Ends",
-                    1,
-                    texts_of=lambda item, now: _lease_text(item, now).removeprefix("ends "),
-                ),
+                Column("lease", "Ends", 1, texts_of=_ends),
                 REQUESTERS,
-                Column(
-                    "term",
-                    "Term",
-                    3,
-                    texts_of=lambda item, now: duration_text(item["lease"]["seconds"]),
-                ),
+                Column("term", "Term", 3, texts_of=_term),
                 HOLDS,
             ),
             _leases,
@@ -791,16 +784,8 @@ KINDS: dict[str, Kind] = {
                     "releases", "Releases", 5, texts_of=lambda item, now: str(len(item["releases"]))
                 ),
                 REQUESTERS,
-                _names("capabilities", "Capabilities", 9, wide=True),
-                Column(
-                    "properties",
-                    "Properties",
-                    9,
-                    texts_of=lambda item, now: [
-                        f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
-                    ],
-                    only_wide=True,
-                ),
+                _wide("capabilities", "Capabilities"),
+                _wide("properties", "Properties", texts_of=_properties),
             ),
             _nodes,
             _node,
@@ -817,7 +802,7 @@ KINDS: dict[str, Kind] = {
                 HOLDS,
                 LEASE,
                 SINCE,
-                _names("nodes", "Nodes", 9, "node", wide=True),
+                _wide("nodes", "Nodes", "node"),
             ),
             _requesters,
             _requester,
@@ -834,7 +819,7 @@ KINDS: dict[str, Kind] = {
                 Column("clusters", "Clusters", 3),
                 Column("nodes", "Nodes", 1, links="node"),
                 Column("rules", "Rules", 6),
-                Column("file", "File", 9, only_wide=True),
+                _wide("file", "File"),
             ),
             _domains,
         ),
@@ -846,7 +831,7 @@ KINDS: dict[str, Kind] = {
                 Column("services", "Services", 1),
                 Column("applications", "Applications", 2, links="application"),
                 Column("charts", "Charts", 3),
-                Column("file", "File", 9, only_wide=True),
+                _wide("file", "File"),
             ),
             _appdefs,
         ),
@@ -854,21 +839,14 @@ KINDS: dict[str, Kind] = {
             "claims",
             "What one demand holds of one subject.",
             (
-                Column(
-                    "subject",
-                    "Subject",
-                    texts_of=lambda item, now: [
-                        subject_text(item),
-                        *(f"held for {id}" for id in item["held_for"]),
-                    ],
-                ),
+                Column("subject", "Subject", texts_of=_subject),
                 STATE,
                 REQUESTERS,
                 Column("demand", "Demand", 3, links="demand"),
                 LEASE,
                 SINCE,
-                Column("request", "Request", 9, only_wide=True),
-                Column("file", "File", 9, only_wide=True),
+                _wide("request", "Request"),
+                _wide("file", "File"),
             ),
             _claims,
             _claim,
@@ -888,7 +866,7 @@ KINDS: dict[str, Kind] = {
                 Column("owner", "Owner", 4),
                 Column("releases", "To", 5, texts_of=_affected),
                 Column("reason", "Reason", 6),
-                Column("priority", "Priority", 9, only_wide=True),
+                _wide("priority", "Priority"),
                 _command("End it", lambda item: ["demandops", "override", "end", item["name"]]),
             ),
             _overrides,
@@ -913,7 +891,7 @@ KINDS: dict[str, Kind] = {
                 Column("summary", "What", 1),
                 Column("required_by", "Required by", 4),
                 Column("link", "Link", 5),
-                _names("demands", "Demands", 9, "demand", wide=True),
+                _wide("demands", "Demands", "demand"),
                 _command("See", lambda item: ["git", "diff", f"origin/main...{item['commit']}"]),
                 _command("Approve", lambda item: _decide(item, "approve")),
                 _command("Refuse", lambda item: _decide(item, "reject")),
@@ -930,7 +908,7 @@ KINDS: dict[str, Kind] = {
                 Column("who", "Who", 2),
                 Column("operation", "Operation", 3, only_wide=True),
                 Column("author", "Author", 3, only_wide=True),
-                Column("request", "Request", 9, only_wide=True),
+                _wide("request", "Request"),
             ),
             _events,
         ),

@@ -171,8 +171,8 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
         around = {"peer": sorted(peers[node.id]) or ["none"]}
         around["cell"] = [_cell(spots[node.id])] if node.id in spots else []
         # a stack's filter names what is around its nodes; a word alone does not look there
-        if wanted.matches(Row(texts)) or (
-            wanted.matches(Row(texts | around)) and not wanted.matches(Row(around))
+        if wanted.matches(Row(texts | around)) and (
+            wanted.matches(Row(texts)) or not wanted.matches(Row(around))
         ):
             chosen.add(node.id)
     lit = (lit | chosen) & known.keys()

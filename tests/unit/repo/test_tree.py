@@ -177,6 +177,17 @@ def test_housekeeping_keeps_a_pack_that_no_reference_leads_to_yet(
     git(tmp_path, "fsck", "--strict")
 
 
+def test_two_that_write_the_same_pack_at_once_leave_its_index_alone(tmp_path: Path) -> None:
+    pygit2.init_repository(tmp_path, bare=True)
+    repos = [pygit2.Repository(tmp_path) for _ in range(2)]
+    one, other = map(NewObjects, repos)
+    first, second = (new.add_tree(None, {"f": "x"}) for new in (one, other))
+    with one.packed(first):
+        assert repos[0].odb.exists(first)  # by the index, which it keeps in memory from now on
+        with other.packed(second):
+            assert repos[0].odb.exists(pygit2.hash("x"))
+
+
 def test_git_reads_packed_files_of_every_size(tmp_path: Path) -> None:
     repo = pygit2.init_repository(tmp_path, bare=True)
     new = NewObjects(repo)
