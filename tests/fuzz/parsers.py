@@ -13,7 +13,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import click
 import pygit2
 import yaml
 from application_manager_interfaces.action import DeploymentRequest
@@ -444,7 +443,7 @@ TARGETS = (
     *(Target(one, _seeds(one)) for one in (marker, waiting_demand)),
     Target(contexts_file, _seeds(contexts_file)),
     Target(detector_rules, (*_seeds(detector_rules), _RULES.read_bytes())),
-    Target(end_of_override, _seeds(end_of_override), expected=(click.BadParameter,)),
+    Target(end_of_override, _seeds(end_of_override), expected=(ValueError,)),
     Target(journal_line, (*_seeds(journal_line), journal._sealed(_LINES, "")[0])),
     *(Target(one, _seeds(one)) for one in (commit, address, revision, moment, forge_answer)),
     *(Target(one, _seeds(one)) for one in (webhook, webhook_address)),

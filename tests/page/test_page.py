@@ -209,7 +209,7 @@ def test_a_dot_of_the_time_line_opens_the_books_of_then(visit: Visits) -> None:
 def test_it_works_without_scripts(visit: Visits) -> None:
     page = visit(java_script_enabled=False).open("/")
     expect(page.locator(".cause").first).to_contain_text("manifest unknown")
-    page.get_by_role("link", name="Services", exact=True).click()
+    page.get_by_role("link", name="Releases", exact=True).click()
     page.locator("#q").fill("od-edge-vehicle00")
     page.locator("#q").press("Enter")
     expect(page.locator("tbody tr")).to_have_count(1)

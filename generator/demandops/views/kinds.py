@@ -24,7 +24,7 @@ from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.views import vocabulary
-from demandops.views.rows import Column, Row, labels_of
+from demandops.views.rows import Column, Row, TextsOf, labels_of
 from demandops.views.source import Source, since_of, word_of, worst_word
 from demandops.views.vocabulary import Json, claim_data, lease_data, subject_text, time_data
 
@@ -140,8 +140,8 @@ LEASE = Column("lease", "Lease", 5, texts_of=_lease_text)
 ENDED = Column("ended", "Ended", 3, texts_of=_ended)
 
 
-def _names(key: str, title: str, rank: int, links: str = "", *, wide: bool = False) -> Column:
-    return Column(key, title, rank, links=links, only_wide=wide)
+def _wide(key: str, title: str, links: str = "", texts_of: TextsOf | None = None) -> Column:
+    return Column(key, title, 9, texts_of=texts_of, links=links, only_wide=True)
 
 
 def _command(title: str, words_of: Callable[[Json], list[str]]) -> Column:
@@ -323,6 +323,18 @@ def _claim(source: Source, claim: Claim, state: str) -> Json:
     return {"name": data["file"], **_held(source, [claim], state), **data}
 
 
+def _subject(item: Json, now: datetime) -> list[str]:
+    return [subject_text(item), *(f"held for {id}" for id in item["held_for"])]
+
+
+def _ends(item: Json, now: datetime) -> str:
+    return _lease_text(item, now).removeprefix("ends ")
+
+
+def _term(item: Json, now: datetime) -> str:
+    return duration_text(item["lease"]["seconds"])
+
+
 def _requesters(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     claims_of: defaultdict[str, list[Claim]] = defaultdict(list)
     waiting: defaultdict[str, list[str]] = defaultdict(list)
@@ -457,6 +469,18 @@ def _asked_topics(topics: dict[str, list[str]], item: Json) -> list[str]:
     ]
 
 
+def _topics(item: Json, now: datetime) -> list[str]:
+    return _asked_topics(carried_topics(item), item)
+
+
+def _inputs(item: Json, now: datetime) -> list[str]:
+    return [text for topics in item["inputs"].values() for text in _asked_topics(topics, item)]
+
+
+def _parameters(item: Json, now: datetime) -> list[str]:
+    return [f"{name} = {value}" for name, value in item["parameters"].items()]
+
+
 def version_texts(item: Json, *_: object) -> list[str]:
     # of what `vocabulary.version_data` returns
     asked = item["versions_asked"].items()
@@ -509,6 +533,10 @@ def _node(
         "requesters": list(requesters_of(claims)),
         "health": health,
     }
+
+
+def _properties(item: Json, now: datetime) -> list[str]:
+    return [f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()]
 
 
 def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -635,9 +663,9 @@ KINDS: dict[str, Kind] = {
                 HOLDS,
                 LEASE,
                 SINCE,
-                _names("requests", "Requests", 9, wide=True),
-                _names("nodes", "Nodes", 9, "node", wide=True),
-                _names("suspended_by", "Suspended by", 9, wide=True),
+                _wide("requests", "Requests"),
+                _wide("nodes", "Nodes", "node"),
+                _wide("suspended_by", "Suspended by"),
             ),
             _demands,
             _demand,
@@ -656,8 +684,8 @@ KINDS: dict[str, Kind] = {
                 REQUESTERS,
                 Column("version", "Version", 7),
                 SINCE,
-                _names("demands", "Demands", 9, "demand", wide=True),
-                _names("releases", "Releases", 9, "release", wide=True),
+                _wide("demands", "Demands", "demand"),
+                _wide("releases", "Releases", "release"),
             ),
             _applications,
             _application,
@@ -699,26 +727,8 @@ KINDS: dict[str, Kind] = {
                 ),
                 _VERSION,
                 _CLUSTER,
-                Column(
-                    "inputs",
-                    "Takes in",
-                    9,
-                    texts_of=lambda item, now: [
-                        text
-                        for topics in item["inputs"].values()
-                        for text in _asked_topics(topics, item)
-                    ],
-                    only_wide=True,
-                ),
-                Column(
-                    "parameters",
-                    "Parameters",
-                    9,
-                    texts_of=lambda item, now: [
-                        f"{n} = {v}" for n, v in item["parameters"].items()
-                    ],
-                    only_wide=True,
-                ),
+                _wide("inputs", "Takes in", texts_of=_inputs),
+                _wide("parameters", "Parameters", texts_of=_parameters),
             ),
             _services,
             _release,
@@ -734,13 +744,8 @@ KINDS: dict[str, Kind] = {
                 Column("source", "From", 2, links="node"),
                 Column("target", "To", 2, links="node"),
                 REQUESTERS,
-                Column(
-                    "topics",
-                    "Topics",
-                    5,
-                    texts_of=lambda item, now: _asked_topics(carried_topics(item), item),
-                ),
-                _names("releases", "Releases", 9, "release", wide=True),
+                Column("topics", "Topics", 5, texts_of=_topics),
+                _wide("releases", "Releases", "release"),
             ),
             _connections,
             _connection,
@@ -756,19 +761,9 @@ KINDS: dict[str, Kind] = {
             "Demands that end unless their requester renews them. The first to end comes first.",
             (
                 Column("name", "Demand", links="demand"),
-                Column(
-                    "lease",
-                    "Ends",
-                    1,
-                    texts_of=lambda item, now: _lease_text(item, now).removeprefix("ends "),
-                ),
+                Column("lease", "Ends", 1, texts_of=_ends),
                 REQUESTERS,
-                Column(
-                    "term",
-                    "Term",
-                    3,
-                    texts_of=lambda item, now: duration_text(item["lease"]["seconds"]),
-                ),
+                Column("term", "Term", 3, texts_of=_term),
                 HOLDS,
             ),
             _leases,
@@ -789,16 +784,8 @@ KINDS: dict[str, Kind] = {
                     "releases", "Releases", 5, texts_of=lambda item, now: str(len(item["releases"]))
                 ),
                 REQUESTERS,
-                _names("capabilities", "Capabilities", 9, wide=True),
-                Column(
-                    "properties",
-                    "Properties",
-                    9,
-                    texts_of=lambda item, now: [
-                        f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
-                    ],
-                    only_wide=True,
-                ),
+                _wide("capabilities", "Capabilities"),
+                _wide("properties", "Properties", texts_of=_properties),
             ),
             _nodes,
             _node,
@@ -815,7 +802,7 @@ KINDS: dict[str, Kind] = {
                 HOLDS,
                 LEASE,
                 SINCE,
-                _names("nodes", "Nodes", 9, "node", wide=True),
+                _wide("nodes", "Nodes", "node"),
             ),
             _requesters,
             _requester,
@@ -832,7 +819,7 @@ KINDS: dict[str, Kind] = {
                 Column("clusters", "Clusters", 3),
                 Column("nodes", "Nodes", 1, links="node"),
                 Column("rules", "Rules", 6),
-                Column("file", "File", 9, only_wide=True),
+                _wide("file", "File"),
             ),
             _domains,
         ),
@@ -844,7 +831,7 @@ KINDS: dict[str, Kind] = {
                 Column("services", "Services", 1),
                 Column("applications", "Applications", 2, links="application"),
                 Column("charts", "Charts", 3),
-                Column("file", "File", 9, only_wide=True),
+                _wide("file", "File"),
             ),
             _appdefs,
         ),
@@ -852,21 +839,14 @@ KINDS: dict[str, Kind] = {
             "claims",
             "What one demand holds of one subject.",
             (
-                Column(
-                    "subject",
-                    "Subject",
-                    texts_of=lambda item, now: [
-                        subject_text(item),
-                        *(f"held for {id}" for id in item["held_for"]),
-                    ],
-                ),
+                Column("subject", "Subject", texts_of=_subject),
                 STATE,
                 REQUESTERS,
                 Column("demand", "Demand", 3, links="demand"),
                 LEASE,
                 SINCE,
-                Column("request", "Request", 9, only_wide=True),
-                Column("file", "File", 9, only_wide=True),
+                _wide("request", "Request"),
+                _wide("file", "File"),
             ),
             _claims,
             _claim,
@@ -886,7 +866,7 @@ KINDS: dict[str, Kind] = {
                 Column("owner", "Owner", 4),
                 Column("releases", "To", 5, texts_of=_affected),
                 Column("reason", "Reason", 6),
-                Column("priority", "Priority", 9, only_wide=True),
+                _wide("priority", "Priority"),
                 _command("End it", lambda item: ["demandops", "override", "end", item["name"]]),
             ),
             _overrides,
@@ -911,7 +891,7 @@ KINDS: dict[str, Kind] = {
                 Column("summary", "What", 1),
                 Column("required_by", "Required by", 4),
                 Column("link", "Link", 5),
-                _names("demands", "Demands", 9, "demand", wide=True),
+                _wide("demands", "Demands", "demand"),
                 _command("See", lambda item: ["git", "diff", f"origin/main...{item['commit']}"]),
                 _command("Approve", lambda item: _decide(item, "approve")),
                 _command("Refuse", lambda item: _decide(item, "reject")),
@@ -928,7 +908,7 @@ KINDS: dict[str, Kind] = {
                 Column("who", "Who", 2),
                 Column("operation", "Operation", 3, only_wide=True),
                 Column("author", "Author", 3, only_wide=True),
-                Column("request", "Request", 9, only_wide=True),
+                _wide("request", "Request"),
             ),
             _events,
         ),
