@@ -30,6 +30,7 @@ GENERATED = {
 OF_THE_ROOT = {
     "README.md": "index.md",
     "CHANGELOG.md": "project/changelog.md",
+    "ARCHITECTURE.md": "project/architecture.md",
     "CONTRIBUTING.md": "project/contributing.md",
     "appdefs/charts/ros-service/README.md": "project/ros-service.md",
     "examples/experiment/rules.yaml": "project/rules.yaml",

@@ -1,7 +1,7 @@
 """DemandOps turns demands of connected vehicles into desired state in Git.
 
 Data flows through the stages in this order: config → demand → ledger → plan → render → decision →
-staterepo → service → cli. ``docs/architecture.md`` describes them and the other folders.
+staterepo → service → cli. ``ARCHITECTURE.md`` describes them and the other folders.
 """
 
 __all__ = ["__version__"]

@@ -25,7 +25,7 @@ from demandops.repo.history import commit_message
 from demandops.repo.merge_check.rendered_charts import manifest_faults
 
 from tests.kit.config import brokers, configuration, edited
-from tests.kit.goals import put
+from tests.kit.goals import EXPERIMENT, put
 from tests.kit.memory import MemoryRepo
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -97,7 +97,7 @@ def test_the_demand_of_the_documentation_runs_with_a_derived_connection() -> Non
         "derived/vehicle00/edge/vehicles/vehicle00/ego_data",
     ]
     assert (decision.lease_s, decision.warnings) == (600, ())
-    goal = data("demand.md", "id: station00/collective-perception")
+    goal = yaml.safe_load(EXPERIMENT[0].read_text())
     assert len(MemoryRepo().send(goal).changes.claims) == 3
 
 
@@ -208,11 +208,11 @@ def test_the_policy_of_the_documentation_refuses_as_it_says(
 
 
 def test_the_policy_of_the_documentation_lets_data_cross_by_its_rules_only() -> None:
-    (policy,) = (text.lstrip() for text in blocks("policy.md") if "name: everybody" in text)
+    policy = (DOCS.parent / "examples" / "policy" / "two-domains.yaml").read_text()
     goal = demand() | {"requesters": ["vehicle00"]}
-    assert MemoryRepo({POLICY: _DOMAINS + policy}).decide(goal).outcome == "booked"
+    assert MemoryRepo({POLICY: policy}).decide(goal).outcome == "booked"
     closed = policy.replace("peers: [city]", "nodes: ['*']")
-    said = refusal(MemoryRepo({POLICY: _DOMAINS + closed}), goal)
+    said = refusal(MemoryRepo({POLICY: closed}), goal)
     told = block("policy.md", "not-allowed: requesters[0]: access domain 'fleet'")
     assert said.replace("rule 'everybody' of ", "") == told
 

@@ -3,6 +3,8 @@
 A comment before a block says what a test does with it::
 
     <!-- run -->                  the commands are run, in the order of the page, in one folder
+    <!-- run all -->              at the top of a page: so are those of all shell blocks without a
+                                  comment of their own
     <!-- tested by tests/… -->    another test covers the commands, or they need a cluster
     <!-- not run: WHY -->
 
@@ -22,7 +24,7 @@ from pathlib import Path
 
 from tests.kit.limits import PATIENCE_S
 
-_TAG = re.compile(r"\s*<!-- (run|tested by [^>]*|not run: [^>]*) -->\s*")
+_TAG = re.compile(r"\s*<!-- (run|run all|tested by [^>]*|not run: [^>]*) -->\s*")
 _FENCE = re.compile(r"(\s*)(`{3,})(\w*)(?: title=\"([^\"]*)\")?\s*")
 _SHELL = ("sh", "bash", "shell", "console")
 _COMMAND = re.compile(
@@ -51,16 +53,17 @@ class Block:
 def blocks(markdown: str) -> Iterator[Block]:
     """Yield the fenced and the indented blocks of a page."""
     lines = markdown.splitlines()
-    tag, at, blank = "", 0, True
+    tag, at, blank, default = "", 0, True, ""
     while at < len(lines):
         line = lines[at]
         fence = _FENCE.fullmatch(line)
         if told := _TAG.fullmatch(line):
-            tag = told[1]
+            tag, default = ("", "run") if told[1] == "run all" else (told[1], default)
         elif fence:
             end = next(n for n in range(at + 1, len(lines)) if lines[n].strip() == fence[2])
             body = textwrap.dedent("\n".join(lines[at + 1 : end]))
-            yield Block(at + 1, fence[3], fence[4] or "", body, tag)
+            told_tag = tag or (default if fence[3] in _SHELL else "")
+            yield Block(at + 1, fence[3], fence[4] or "", body, told_tag)
             tag, at = "", end
         elif blank and line.startswith("    ") and not re.match(r"\s*(?:[-*|]|\d+\.) ", line):
             end = at
@@ -78,7 +81,7 @@ def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
     """Write the files of a page and run its commands.
 
     Raise an AssertionError if a command's output differs from what the page shows; the exit code
-    does not count then. If the page shows no output, raise the error only if the command fails.
+    does not count then. If the page shows no output, or only `…`, the command must succeed.
     """
     state = folder / ".state"
     state.write_text(f"cd {folder}\n")
@@ -91,7 +94,7 @@ def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
             for command, expected in _commands(block):
                 ran = _ran(command, state, environment)
                 said = f"line {block.line}: {command}\n{ran.stdout}"
-                if expected is None:
+                if expected in (None, "…"):
                     assert ran.returncode == 0, said
                 else:
                     assert _pattern(expected).fullmatch(f"{ran.stdout.rstrip()}\n"), said

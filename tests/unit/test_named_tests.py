@@ -43,7 +43,7 @@ def test_a_test_that_a_page_names_exists(page: str) -> None:
 
 
 def test_each_function_on_the_path_of_a_demand_exists() -> None:
-    page = (ROOT / "docs" / "architecture.md").read_text()
+    page = (ROOT / "ARCHITECTURE.md").read_text()
     path = re.findall(r"^\|[^|]*\| `([\w.]+)` \| `([\w.]+)` \|", page, re.MULTILINE)
     assert len(path) > 30
     for function, module in path:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
@@ -17,13 +16,8 @@ from tests.kit.config import edited, skeleton
 from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
-PAGE = (Path(__file__).parents[3] / "docs" / "appdef.md").read_text()
+EXAMPLE = (Path(__file__).parents[3] / "examples" / "map-server" / "service.yaml").read_text()
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
-(EXAMPLE,) = (
-    re.sub("^    ", "", found, flags=re.MULTILINE)
-    for found in re.findall(r"(?:^    .*\n)+", PAGE, re.MULTILINE)
-    if "scope: cluster" in found
-)
 
 
 def files(service: str) -> dict[str, str]:
