@@ -27,7 +27,7 @@ from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve import agenda
 from demandops.serve.agenda import Agenda, Backoff, RateLimit, What
-from demandops.serve.approvals.approvals import Approvals, Result
+from demandops.serve.approvals import Approvals, Result
 from demandops.serve.demands import TAKEN_BACK, Demands
 from demandops.serve.journal import Receipt, Ticket
 from demandops.templating.evaluator import DEMAND_S, processor_time

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlparse
 
 import pytest
-from demandops.serve.approvals import forge_worker
+from demandops.serve import forge_worker
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig

@@ -39,8 +39,10 @@ from demandops.repo.write.proposal_branch import (
     ProposalBranches,
     branch_name,
 )
-from demandops.serve.approvals.forge_worker import ForgeWorker
-from demandops.serve.approvals.proposal import (
+from demandops.serve.demands import TAKEN_BACK, Demands
+from demandops.serve.forge_worker import ForgeWorker
+from demandops.serve.journal import ProposalRecord, Receipt, Ticket
+from demandops.serve.proposal import (
     Proposal,
     Verdict,
     admit_or_none,
@@ -53,8 +55,6 @@ from demandops.serve.approvals.proposal import (
     releases,
     waiting_text,
 )
-from demandops.serve.demands import TAKEN_BACK, Demands
-from demandops.serve.journal import ProposalRecord, Receipt, Ticket
 
 log = logging.getLogger("demandops")
 
