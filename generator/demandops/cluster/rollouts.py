@@ -25,7 +25,7 @@ from demandops.cluster.health import (
     why_unavailable,
     worst,
 )
-from demandops.cluster.object_cache import ObjectCache, object_caches
+from demandops.cluster.watches import ObjectCache, object_caches
 from demandops.decide.decision import Decision
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import plan

@@ -18,7 +18,6 @@ from demandops.cluster.health import (
     Target,
     health_reader,
 )
-from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.rollouts import (
     ChangedPaths,
     OldBootstrap,
@@ -30,6 +29,7 @@ from demandops.cluster.rollouts import (
     statuses,
     target_of,
 )
+from demandops.cluster.watches import ObjectCache
 from demandops.decide.override_report import Entry, override_report, override_state
 from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
