@@ -254,8 +254,10 @@ def faults_of_demand(
 def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fault]:
     """Yield a fault for each id that is missing, may change, or would be that of two events."""
     data: Any = template.data
+    for name in ("demand", "requesters") if template.action == "Demand" else ("id",):
+        if not data.get(name):
+            yield fault(f"{field}.{name}", "is missing; add it")
     if template.action == "Demand":
-        yield from _missing(data, field, "demand", "requesters")
         why = "otherwise two events would share one demand"
         listed: list[tuple[str, Sequence[str]]] = [("demand", [data.get("demand", "")])]
         for name, what in (("demand", "id"), ("requesters", "requesters")):
@@ -266,7 +268,6 @@ def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fau
                     )
                     yield fault(path, f"{message}leave that name out")
     else:
-        yield from _missing(data, field, "id")
         why = "a shutdown ends what its requesters joined, so each event needs its own requesters"
         listed = [*requester_lists(template.action, data)]
     for path, values in listed:
@@ -274,12 +275,6 @@ def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fau
         if missing and any(values):
             named = " and ".join(sorted(missing))
             yield fault(f"{field}.{path}", f"must name {named}, because {why}")
-
-
-def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: ANN401 - plain data
-    for name in needed:
-        if not data.get(name):
-            yield fault(f"{field}.{name}", "is missing; add it")
 
 
 # ---- the file of rules, and the checks across its parts ----

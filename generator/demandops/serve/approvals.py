@@ -40,9 +40,9 @@ from demandops.repo.write.proposal_branch import (
     branch_name,
 )
 from demandops.serve.demands import TAKEN_BACK, Demands
-from demandops.serve.forge_worker import ForgeWorker
 from demandops.serve.journal import ProposalRecord, Receipt, Ticket
 from demandops.serve.proposal import (
+    ForgeWorker,
     Proposal,
     Verdict,
     admit_or_none,
@@ -130,11 +130,9 @@ class Approvals:
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier):
-            if (
-                request
-                and isinstance(result, Decision)
-                and releases(request, [result.request], state.config)
-            ):
+            if not (request and isinstance(result, Decision)):
+                continue
+            if releases(request, [result.request], state.config):
                 earlier[index] = (ticket, errors.Withdrawn(RELEASED))
                 by.has_released = True
 
