@@ -36,13 +36,7 @@ from demandops.model.config.repo_settings import RepoSettings
 from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import World
 from demandops.model.release import Release, ServiceRelease
-from demandops.render.gitops import (
-    bootstrap_path,
-    digest_in,
-    digest_of,
-    domains_in_use,
-    project_of,
-)
+from demandops.render.gitops import bootstrap_path, digest_in, digest_of, domains_in_use, project_of
 
 log = logging.getLogger("demandops")
 
