@@ -134,13 +134,6 @@ class Proposal:
         gone = [ticket for ticket, _ in answered]
         self.tickets = [ticket for ticket in self.tickets if ticket not in gone]
 
-    def wait_for(self, left: Decided) -> None:
-        self.tickets = [ticket for ticket, _ in left]
-        self.requests = [decision.request for _, decision in left]
-        self.reasons = tuple(
-            dict.fromkeys(why for _, decision in left for why in decision.approval)
-        )
-
     def goals(self) -> list[str]:
         # as JSON, because in Python 1 equals true
         tickets = (ticket for ticket in self.tickets if ticket.state == "proposed")
