@@ -33,7 +33,7 @@ from demandops.model.release import Release, ServiceRelease
 from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import PARTIAL, open_folder, reading
-from demandops.repo.history import revisions
+from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot as snapshots
 
 # ---- overrides in place of manual edits, for values, replicas and images ----
@@ -288,7 +288,7 @@ def base_of(repo: Repository, revision: str | None, files: Mapping[str, str]) ->
     target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
     head = repo.head.peel(Commit)
     try:
-        tip = revisions.resolve(repo, head.id, target, REAL.now()) if target else None
+        tip = commit_log.resolve(repo, head.id, target, REAL.now()) if target else None
         common = repo.merge_base(head.id, tip.id) if tip is not None else None
     except (StateRepoError, pygit2.GitError, KeyError):
         if repo.is_shallow:
