@@ -181,7 +181,7 @@ _PUSH = (
 class RemoteRepository(StateRepository):
     """A state repo behind a URL, in a bare clone."""
 
-    always_current = False
+    always_current = on_this_disk = False
     main_reference = _REMOTE_MAIN
     branches = "refs/remotes/origin/"
 
