@@ -109,10 +109,6 @@ class Loader(_CLoader):  # type: ignore[misc]
                     raise _problem("another document starts here; only one is allowed", event)
                 yield self._value(self.get_event(), 1)
 
-    def get_single_data(self) -> Any:  # noqa: ANN401 - for yaml.load
-        documents = [*self.documents(1)]
-        return documents[0] if documents else None
-
     def _value(self, event: Any, depth: int) -> Any:  # noqa: ANN401, PLR0912
         kind = type(event)
         if kind is yaml.AliasEvent or event.anchor:
