@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from types import MappingProxyType
 from typing import NamedTuple
 
 from pygit2 import Commit, Oid, Repository, Tree
@@ -563,7 +562,7 @@ def _without(state: State, changes: Iterable[ClaimChange]) -> State:
     return state.with_ledger(ledger, undone) if undone else state
 
 
-def render_all(tree: Tree, state: State, more: Files = MappingProxyType({})) -> Changeset:
+def render_all(tree: Tree, state: State, more: Files) -> Changeset:
     """Return the generated files that differ from those of ``tree``, and the files ``more``."""
     generated = trees.texts(tree, GENERATED_ROOTS)
     files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))
