@@ -20,7 +20,7 @@ from demandops.views.rows import Filter, page_of
 from demandops.views.source import Source
 from demandops.web import fleet_map, time_line
 from demandops.web.follower import Follower
-from demandops.web.thing import thing
+from demandops.web.page_views import thing
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes

@@ -149,9 +149,18 @@ def _with_parameters(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]
         where, values = f"applications[{index}]", dict(given)
         problems = {f"{where}.parameters.{name}": _value_problem(given[name], 0) for name in given}
         for name, text in texts.items():
-            problem = "is already given in parameters; give it once"
-            if name not in given:
-                values[name], problem = _json_value(text)
+            try:
+                if name in given:
+                    problem = "is already given in parameters; give it once"
+                else:
+                    values[name] = json.loads(text)
+                    problem = _value_problem(values[name], 0)
+            except (json.JSONDecodeError, TypeError):
+                problem = 'is not JSON; text needs its own quotes, as in ""fast""'
+            except RecursionError:
+                problem = _TOO_DEEP
+            except ValueError:  # Python refuses to convert integers of more than 4300 digits
+                problem = "has an integer of too many digits; write a shorter one"
             problems[f"{where}.parameters_json.{name}"] = problem
         faults.extend(fault(field, problem) for field, problem in problems.items() if problem)
         others = {name: value for name, value in app.items() if name != "parameters_json"}
@@ -161,19 +170,6 @@ def _with_parameters(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]
     if isinstance(listed, list):
         goal = goal | {"applications": [read(index, app) for index, app in enumerate(listed)]}
     return goal, faults
-
-
-def _json_value(text: object) -> tuple[Any, str]:
-    """Return the value of a JSON text, or what is wrong with it."""
-    try:
-        value = json.loads(text)  # type: ignore[arg-type]
-    except (json.JSONDecodeError, TypeError):
-        return None, 'is not JSON; text needs its own quotes, as in ""fast""'
-    except RecursionError:
-        return None, _TOO_DEEP
-    except ValueError:  # Python refuses to convert integers of more than 4300 digits
-        return None, "has an integer of too many digits; write a shorter one"
-    return value, _value_problem(value, 0)
 
 
 # How many levels a parameter's value may have. It is a part of a claim's file, which may have 100.
