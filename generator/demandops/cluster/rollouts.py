@@ -196,7 +196,6 @@ class ReleaseStatus:
         return self.health.state if self.seen or self.health.object else "unknown"
 
 
-_NO_ACCESS = ReleaseStatus(Health("waiting"))
 # Returns the paths in which two commits differ, if that is known.
 ChangedPaths = Callable[[str, str], "Collection[str] | None"]
 
@@ -206,7 +205,7 @@ def statuses(
     commit: str,
     caches: Mapping[str, ObjectCache],
     history: History,
-    changed: ChangedPaths = lambda seen, commit: None,
+    changed: ChangedPaths,
 ) -> list[ReleaseStatus]:
     changed = cache(changed)
     history = _CachedHistory(history)
@@ -216,7 +215,7 @@ def statuses(
     for target in targets:
         domain = target.domain
         if (store := caches.get(domain.cluster)) is None:
-            results.append(_NO_ACCESS)
+            results.append(ReleaseStatus(Health("waiting")))
             continue
         if domain not in unread:
             unread[domain] = store.unknown_health(domain)
