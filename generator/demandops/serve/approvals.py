@@ -170,11 +170,9 @@ class Approvals:
                 return
             replaces = ""
             if replaced:
-                first = replaced[0].record
+                was = replaced[0].record
                 # nobody has seen one without a commit, so the one that it replaces still counts
-                replaces = (
-                    f"{first.branch} {first.commits[-1]}" if first.commits else first.replaces
-                )
+                replaces = f"{was.branch} {was.commits[-1]}" if was.commits else was.replaces
             proposal = Proposal(ProposalRecord(branch, replaces=replaces), searched_to=ticket.base)
         if not self._demands.propose(ticket, proposal.record):
             self._demands.fail([ticket], errors.Withdrawn(TAKEN_BACK))
