@@ -22,7 +22,6 @@ from demandops.cluster.health import (
     Target,
     health_reader,
     name_of,
-    why_unavailable,
     worst,
 )
 from demandops.cluster.watches import ObjectCache, object_caches
@@ -391,8 +390,8 @@ class RolloutWatcher:
             with suppress(Exception):
                 for domain in rollout.domains:
                     if domain.namespace == namespace:
-                        pods = self._caches[domain.cluster].pods(namespace, deployment)
-                        if reason := why_unavailable(pods):
+                        store = self._caches[domain.cluster]
+                        if reason := store.why_unavailable(namespace, deployment):
                             health = replace(health, reason=f"{health.reason}; {reason}")
                             break
         self._resolve(rollout, health)
