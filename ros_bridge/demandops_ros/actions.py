@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -222,13 +223,12 @@ class GoalSender:
             except DemandError:
                 continue
             self._is_discovered = True
+
         # The goal is sent in the thread that also receives: rclpy 9.1 registers two futures for a
         # goal, one after the other, and returns the second. If another thread sent the goal, a
         # response could arrive between the two, and would resolve only the first, for which nobody
         # waits.
-        sent: Future[Any]
-
-        def send() -> None:
+        def send(sent: Future[Any]) -> None:
             try:
                 sent.set_result(
                     self._client.send_goal_async(
@@ -244,8 +244,8 @@ class GoalSender:
         lost = False
         while True:
             try:
-                sent = Future()
-                self._thread.call(send)
+                sent: Future[Any] = Future()
+                self._thread.call(partial(send, sent))
                 response = self._await(sent, deadline)
                 handle = self._await(response, min(deadline, REAL.monotonic() + _UNHEARD_S))
                 break
