@@ -13,7 +13,7 @@ from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.object_cache import object_caches
+from demandops.cluster.watches import object_caches
 from demandops.repo.git.repository import reading
 from demandops.repo.load.snapshot import Progress
 from demandops.repo.reader import Reader

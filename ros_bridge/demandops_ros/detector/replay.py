@@ -14,11 +14,12 @@ from demandops.base.errors import InvalidInput
 from demandops.base.quoting import one_line
 from demandops.cli import json_output
 from demandops.cli.output import errors
-from demandops.cli.table import Column, Table
+from demandops.cli.table import Table
 from demandops.detect.condition import Count, Near, entity_in
 from demandops.detect.detector import Detector
-from demandops.detect.observations import Event, Key, MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Event, Key, MessageReader, Observation, Unreadable
 from demandops.detect.rule_file import Goal, RuleFile
+from demandops.views.rows import Column
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -262,8 +263,8 @@ def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
 
 
 def show(replay: Replay, output: str) -> None:
-    columns = [Column(name) for name in ("Second", "Change", "Rule", "Entities")]
-    columns += [Column("Why", rank=2), Column("Demand", rank=1)]
+    ranks = {"second": 0, "change": 0, "rule": 0, "entities": 0, "why": 2, "demand": 1}
+    columns = [Column(key, key.capitalize(), rank) for key, rank in ranks.items()]
     rows = [
         (
             f"{event.at - replay.span[0]:.1f}",
