@@ -17,7 +17,7 @@ from demandops.decide.bookkeeping import bookkeeping as derive
 from demandops.decide.changeset import MergePreview, ReleaseChange, planned_releases, preview
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
-from demandops.repo.history import revisions
+from demandops.repo.history import commit_log
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.views.kinds import KINDS, rows_of
@@ -136,7 +136,7 @@ def differences(
 def resolved(repo: Reader, revision: str | None) -> str:
     """Return the id of a commit; if a time names it, say which commit that is."""
     commit, text = repo.commit(revision), revision or ""
-    time = revisions.parse_time(text, REAL.now(), end=True)
+    time = commit_log.parse_time(text, REAL.now(), end=True)
     if time is not None and not commit.startswith(text.lower()):
         entry = next(repo.log(commit))
         errors.print(
