@@ -22,7 +22,7 @@ from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.slot import Slot
 from demandops.serve.agenda import heartbeat_in
-from demandops.serve.approvals.approvals import Approvals
+from demandops.serve.approvals import Approvals
 from demandops.serve.demands import Demands
 from demandops.serve.journal import Listener, Ticket, open_journal
 from demandops.serve.worker import RemoteStatus, Worker

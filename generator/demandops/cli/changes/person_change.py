@@ -43,7 +43,7 @@ from demandops.repo.history.commit_log import Person
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails
-from demandops.serve.approvals.proposal import merge_request
+from demandops.serve.proposal import merge_request
 from demandops.views import vocabulary
 from demandops.views.vocabulary import Json
 
