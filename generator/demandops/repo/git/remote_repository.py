@@ -275,9 +275,6 @@ class RemoteRepository(StateRepository):
         self._fetch(urgent)
         return self.tip()
 
-    def write_anew(self, since: str) -> None:
-        pass  # the remote has confirmed what it stored
-
     def publish(self, expected: Oid, commit: Oid) -> bool:
         # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
         try:
