@@ -6,9 +6,9 @@ whenever it is shown, and is stored nowhere.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quantities import amount_text
@@ -26,6 +26,7 @@ _LEFT_OUT = ("demands", "suspended", "nodes", "waiting", "targets", "listed")
 # Topic → the requesters of the topic, sorted.
 _Requesters: TypeAlias = dict[str, list[str]]
 Json: TypeAlias = dict[str, Any]
+Kind = Literal["service", "connection"]
 
 
 def bookkeeping(world: World) -> Json:
@@ -201,7 +202,7 @@ def as_data(view: Json, commit: str) -> Json:
 
 @dataclass(frozen=True, slots=True)
 class EntryChange:
-    kind: Literal["service", "connection"]
+    kind: Kind
     name: str
     change: Literal["added", "changed", "removed"]
     requesters: list[str]  # the last ones
@@ -209,26 +210,21 @@ class EntryChange:
     gained: tuple[str, ...] = ()
 
 
-def _changes(
-    kind: Literal["service", "connection"], old: Mapping[str, Json], new: Mapping[str, Json]
-) -> Iterator[EntryChange]:
-    for name in sorted({*old, *new}):
-        if name not in new:
-            yield EntryChange(kind, name, "removed", old[name]["requesters"])
-        elif name not in old:
-            yield EntryChange(kind, name, "added", new[name]["requesters"])
-        elif old[name] != new[name]:
-            had, has = list(_facts(old[name], new[name])), list(_facts(new[name], old[name]))
-            lost = tuple(fact for fact in had if fact not in has)
-            gained = tuple(fact for fact in has if fact not in had)
-            yield EntryChange(kind, name, "changed", new[name]["requesters"], lost, gained)
-
-
 def bookkeeping_changes(old: Json, new: Json) -> tuple[EntryChange, ...]:
-    return (
-        *_changes("service", old["services"], new["services"]),
-        *_changes("connection", old["connections"], new["connections"]),
-    )
+    changes, kinds = list[EntryChange](), get_args(Kind)
+    for kind, was, now in ((kind, old[f"{kind}s"], new[f"{kind}s"]) for kind in kinds):
+        for name in sorted({*was, *now}):
+            if name not in now:
+                changes.append(EntryChange(kind, name, "removed", was[name]["requesters"]))
+            elif name not in was:
+                changes.append(EntryChange(kind, name, "added", now[name]["requesters"]))
+            elif was[name] != now[name]:
+                had, has = list(_facts(was[name], now[name])), list(_facts(now[name], was[name]))
+                lost = tuple(fact for fact in had if fact not in has)
+                gained = tuple(fact for fact in has if fact not in had)
+                who = now[name]["requesters"]
+                changes.append(EntryChange(kind, name, "changed", who, lost, gained))
+    return tuple(changes)
 
 
 def _facts(entry: Json, other: Json) -> Iterator[str]:

@@ -106,34 +106,26 @@ class _StandingRoutes:
         others = bringing if not exact else ()
         for holders in ([each for each in bringing if each.demand == demand], exact, others):
             found = []
-            for claim, route in self._bringing(holders, same):
-                key, is_own = claim.connection.key_of(route), claim.demand == demand
-                was_listed = is_own and not route.implied
-                # from another node, only an earlier goal of the demand itself brings it
-                if key.sender != same.sender and not (is_join and was_listed):
-                    continue
-                if key.topic != same.topic and ("." in flow.name or flow.delivery is not None):
-                    continue
-                # a put gives up what it listed and lists no longer
-                if key.topic != same.topic and was_listed and not is_join:
-                    continue
-                found.append((key != same, claim.subject.id, claim, route))
+            for claim in filter(None, map(self.ledger.get, sorted(holders, key=_ORDER))):
+                if claim.key not in self._by_target:
+                    by_target = self._by_target[claim.key] = {}
+                    for route in claim.connection.topics:
+                        by_target.setdefault(claim.connection.key_of(route)[2:], []).append(route)
+                for route in self._by_target[claim.key].get(same[2:], ()):
+                    key = claim.connection.key_of(route)
+                    was_listed = claim.demand == demand and not route.implied
+                    # from another node, only an earlier goal of the demand itself brings it
+                    if key.sender != same.sender and not (is_join and was_listed):
+                        continue
+                    # a put gives up what it listed and lists no longer
+                    by_name = "." in flow.name or flow.delivery is not None
+                    if key.topic != same.topic and (by_name or (was_listed and not is_join)):
+                        continue
+                    found.append((key != same, claim.subject.id, claim, route))
             if found:
                 *_, claim, route = min(found, key=lambda each: each[:2])
                 return claim, route
         return None
-
-    def _bringing(
-        self, holders: Iterable[ClaimKey], same: RouteKey
-    ) -> Iterator[tuple[Claim, Route]]:
-        for claim in filter(None, map(self.ledger.get, sorted(holders, key=_ORDER))):
-            if claim.key not in self._by_target:
-                routes: dict[tuple[str, ...], list[Route]] = {}
-                for route in claim.connection.topics:
-                    routes.setdefault(claim.connection.key_of(route)[2:], []).append(route)
-                self._by_target[claim.key] = routes
-            for route in self._by_target[claim.key].get(same[2:], ()):
-                yield claim, route
 
 
 # ---- carriers: each route of a demand gets its connection ----

@@ -23,13 +23,7 @@ from demandops.model.config.config import (
     VERSIONS_FILE,
     Config,
 )
-from demandops.model.demand.demand import (
-    LONGEST_S,
-    Application,
-    Connect,
-    Delivery,
-    Demand,
-)
+from demandops.model.demand.demand import LONGEST_S, Application, Connect, Delivery, Demand
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
 

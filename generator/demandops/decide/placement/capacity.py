@@ -19,7 +19,6 @@ from demandops.decide.planning import release_keys
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.config import NODES_FILE, Config
-from demandops.model.config.inventory import Node
 from demandops.model.ledger.ledger import ClaimChange, World
 from demandops.model.release import Release, ServiceRelease, most_replicas
 
@@ -125,12 +124,3 @@ def refuse_excess(usage: Usage, grown: Mapping[Need, int], config: Config) -> No
     refusal = NoRoom(usage, grown, config)
     if refusal.full:
         raise refusal
-
-
-def overcommitted(world: World, usage: Usage) -> Iterator[tuple[Node, str]]:
-    for (id, resource), used in sorted(usage.amounts.items()):
-        node = world.config.nodes.get(id)
-        most = node.most(resource) if node else None
-        if node and most is not None and used > most:
-            used_text, most_text = amount_text(used, resource), amount_text(most, resource)
-            yield node, f"services request {used_text} {resource}, but the node has {most_text}"

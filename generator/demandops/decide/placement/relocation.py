@@ -111,7 +111,17 @@ def with_moves(
             if fixed := next(filter(None, (_why_fixed(c, node, service) for c in claims)), ""):
                 stays.append(f"{what[0]} stays, because {fixed}")
                 continue
-            choice = _choice_for(world, claims, service, usage)
+            # another node is chosen by what all the claims require and read
+            apps = [claim.application for claim in claims]
+            places = (app.place or Requirement() for app in apps)
+            own = candidates.requirement_of(service) if service else None
+            required = own or reduce(Requirement.united, places)
+            inputs: dict[str, dict[InputTopic, None]] = {}
+            for role, topics in (each for app in apps for each in app.inputs.items()):
+                inputs.setdefault(role, {}).update(dict.fromkeys(topics))
+            united = apps[0].with_inputs({role: (*topics,) for role, topics in inputs.items()})
+            item = Item(united, requesters_of(claims))
+            choice = Choice(item, required, Room(world, usage), service)
             try:
                 chosen, moving = choice.first(partial(_moved, world, names, usage, claims, service))
             except Refused as refusal:
@@ -163,20 +173,6 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
         return []
     apps = ((id, ledger.application(id)) for id in ledger.ids_with("node", node))
     return [id for id, app in apps if app and node in app.chosen_nodes]
-
-
-def _choice_for(
-    world: World, claims: tuple[Claim, ...], service: Service | None, usage: Usage
-) -> Choice:
-    """Return the choice of another node, by what all the claims require and read."""
-    places = (claim.application.place or Requirement() for claim in claims)
-    required = candidates.requirement_of(service) if service else reduce(Requirement.united, places)
-    inputs: dict[str, dict[InputTopic, None]] = {}
-    for claim in claims:
-        for role, topics in claim.application.inputs.items():
-            inputs.setdefault(role, {}).update(dict.fromkeys(topics))
-    app = claims[0].application.with_inputs({role: (*topics,) for role, topics in inputs.items()})
-    return Choice(Item(app, requesters_of(claims)), required, Room(world, usage), service)
 
 
 def _moved(
