@@ -219,7 +219,15 @@ class _Carriers:
             booked_route = replace(current, implied=True, listed="")
         else:
             booked_route = replace(route, listed=listed.id if is_elsewhere else "")
-        booked_route = _turned(booked_route, key, header, current)
+        # from the source of its carrier to the target, or back
+        turned = (key.topic, key.target, False)
+        if header.source == header.target:
+            same = current or booked_route
+            turned = (same.source, same.target, same.reverse)
+        elif header.source != key.sender:
+            turned = (key.target, key.topic, True)
+        source, target, reverse = turned
+        booked_route = replace(booked_route, source=source, target=target, reverse=reverse)
         differs = _difference(listed, header, self._config)
         if is_elsewhere or differs:
             what = f" of connection '{listed.id}'" if item.is_listed else ""
@@ -287,18 +295,6 @@ class _Carriers:
                 places=places,
                 is_listed=listing is not None,
             )
-
-
-def _turned(route: Route, key: RouteKey, carrier: Connection, current: Route | None) -> Route:
-    """Return the route from the source of its carrier to the target, or back."""
-    if carrier.source == carrier.target:
-        turned = current or route
-        names = (turned.source, turned.target, turned.reverse)
-    elif carrier.source == key.sender:
-        names = (key.topic, key.target, False)
-    else:
-        names = (key.target, key.topic, True)
-    return replace(route, source=names[0], target=names[1], reverse=names[2])
 
 
 def _difference(listed: Connection, carrier: Connection, config: Config) -> str:

@@ -10,7 +10,7 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.base.runtime import REAL
 from demandops.cli.json_output import output_option, show
 from demandops.cli.target import names_of, state_repo_option
-from demandops.decide.admission.may import may_demand
+from demandops.decide.decision import may_demand
 from demandops.repo import reader
 
 

@@ -102,7 +102,18 @@ def with_moves(
             if at == node and name in definitions
         ]
         for service in leaving:
-            ids = _moving_with(id, service, node, world)
+            ids = [id]
+            now = world.ledger.application(id)
+            if now and service and service.scope == "topic":
+                # They share the instances of the service on the node. If only some moved, the
+                # application's node would get the same outputs from two nodes.
+                ids = [
+                    each
+                    for each in applications_of(world.ledger, node)
+                    if (other := world.ledger.application(each))
+                    and other.services.get(service.name) == node
+                    and candidates.shares(service, now, other)
+                ]
             claims = tuple(claim for id in ids for claim in world.ledger.application_claims(id))
             what = [f"application '{id}'" for id in ids]
             what = [f"service '{service.name}' of {text}" for text in what] if service else what
@@ -137,22 +148,6 @@ def with_moves(
         last = ""
     moves = claim_changes(start.ledger, world.ledger, keys)
     return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays), last=last)
-
-
-def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
-    app = world.ledger.application(id)
-    if service is None or service.scope != "topic" or app is None:
-        return [id]
-    # They share the instances of the service on the node. If only some moved, the application's
-    # node would get the same outputs from two nodes.
-    others = {each: world.ledger.application(each) for each in applications_of(world.ledger, node)}
-    return [
-        each
-        for each, other in others.items()
-        if other
-        and other.services.get(service.name) == node
-        and candidates.shares(service, app, other)
-    ]
 
 
 def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
