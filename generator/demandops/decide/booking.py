@@ -9,7 +9,7 @@ from datetime import datetime
 from demandops.base.errors import Fault, Refused, fault, suggestion
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections import connection as routes
-from demandops.connections.connection import Connection, Route
+from demandops.connections.connection import Connection
 from demandops.decide.admission import admission, permission
 from demandops.model.demand.demand import (
     Application,
@@ -269,7 +269,8 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
 
 
 # (words, claims and their topics) for each topic that a shutdown lists; no words: for the subject
-_Listed = Iterator[tuple[str, list[tuple[ClaimKey, set[TopicKey]]]]]
+_Keys = list[tuple[ClaimKey, set[TopicKey]]]
+_Listed = Iterator[tuple[str, _Keys]]
 
 
 def _listed_inputs(listed: Application, claims: list[Claim]) -> _Listed:
@@ -299,25 +300,21 @@ def _listed_routes(listed: Connection, claims: list[Claim]) -> _Listed:
         }
         yield "", [(key, set[TopicKey](topics)) for key, topics in listing.items() if topics]
         return
-    held = [(route, list(_keys_of(route, listed, claims))) for route in listed.topics]
+    held: list[tuple[str, _Keys]] = []
+    for route in listed.topics:
+        named, keys = (route.read_topic, route.written_topic), _Keys()
+        for claim in claims:
+            is_same = claim.subject == listed.subject
+            booked = claim.connection.route(route.source) if is_same else None
+            for other in filter(None, map(claim.connection.route, dict.fromkeys(named))):
+                if booked is None and (other.read_topic, other.written_topic) == named:
+                    booked = other
+            if booked:
+                keys.append((claim.key, {(booked.source,)}))
+        held.append((f"topic {route.source}", keys))
     if not any(keys for _, keys in held) and not any(c.subject == listed.subject for c in claims):
-        yield "", []
-        return
-    for route, keys in held:
-        yield f"topic {route.source}", keys
-
-
-def _keys_of(
-    route: Route, listed: Connection, claims: list[Claim]
-) -> Iterator[tuple[ClaimKey, set[TopicKey]]]:
-    for claim in claims:
-        named = (route.read_topic, route.written_topic)
-        booked = claim.connection.route(route.source) if claim.subject == listed.subject else None
-        for other in filter(None, map(claim.connection.route, dict.fromkeys(named))):
-            if booked is None and (other.read_topic, other.written_topic) == named:
-                booked = other
-        if booked:
-            yield claim.key, {(booked.source,)}
+        held = [("", [])]
+    yield from held
 
 
 def decommission(  # noqa: PLR0912 - of four kinds

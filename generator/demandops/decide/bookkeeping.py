@@ -55,21 +55,58 @@ def bookkeeping(world: World) -> Json:
     ]
     waiting = [
         {
-            "demand": demand.demand,
-            "requesters": list(demand.requesters),
-            "since": demand.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
-            "priority": demand.put.priority,
+            "demand": each.demand,
+            "requesters": list(each.requesters),
+            "since": each.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "priority": each.put.priority,
         }
-        for demand in in_turn(world.ledger.waiting)
+        for each in in_turn(world.ledger.waiting)
     ]
+    by_demand: dict[str, list[Claim]] = {}
+    subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
+    for claim in (claim for subject in subjects for claim in world.ledger.claims_on(subject)):
+        if claim.keeping_override is None:  # a claim that an override keeps is of no demand
+            by_demand.setdefault(claim.demand, []).append(claim)
+    # also those whose claims are suspended, but no service or connection counts these claims
+    demands: dict[str, Json] = {}
+    for demand, held in sorted(by_demand.items()):
+        demands[demand] = {
+            # the ROS action that takes such a demand
+            "action": "DeploymentRequest" if held[0].joined else "Demand",
+            "request": held[0].request,
+            "requesters": list(requesters_of(held)),
+        }
+        # applications that it does not list, each with those that read its outputs
+        held_for = {
+            claim.subject.id: list(claim.application.held_for)
+            for claim in held
+            if claim.is_on_application and claim.application.held_for
+        }
+        if held_for:
+            demands[demand]["held_for"] = held_for
+    # of those that declare a capacity, what services request of each resource, and the capacity
+    usage, config, nodes = whole_usage(world), world.config, dict[str, dict[str, Json]]()
+    # A machine that is in several access domains is one entry, because it has one capacity.
+    machines = {id: node for id, node in config.nodes.items() if id not in config.hosts}
+    for id, node in sorted(machines.items()):
+        names = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
+        limits = ((name, node.most(name)) for name in sorted(names))
+        resources = {
+            name: {
+                "requested": amount_text(usage.of(id, name), name),
+                "capacity": amount_text(most, name),
+            }
+            for name, most in limits
+            if most is not None
+        }
+        if resources:
+            nodes[id] = resources
     return {
         "services": dict(sorted(services.items())),  # by release name
         "connections": connections,
-        # also those whose claims are suspended, but no service or connection counts these claims
-        "demands": _demands(world),
+        "demands": demands,
         "suspended": suspended,
-        # of those that declare a capacity, what services request of each resource, and the capacity
-        "nodes": _nodes(world),
+        "nodes": nodes,
         "waiting": waiting,  # in the order of the tries to book
     }
 
@@ -128,52 +165,6 @@ def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[st
         if claim.application.version:
             asking.setdefault(claim.application.version, set()).update(claim.requesters)
     return {version: sorted(requesters) for version, requesters in sorted(asking.items())}
-
-
-def _demands(world: World) -> dict[str, Json]:
-    by_demand: dict[str, list[Claim]] = {}
-    subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
-    for claim in (claim for subject in subjects for claim in world.ledger.claims_on(subject)):
-        if claim.keeping_override is None:  # a claim that an override keeps is of no demand
-            by_demand.setdefault(claim.demand, []).append(claim)
-    demands: dict[str, Json] = {}
-    for demand, claims in sorted(by_demand.items()):
-        demands[demand] = {
-            # the ROS action that takes such a demand
-            "action": "DeploymentRequest" if claims[0].joined else "Demand",
-            "request": claims[0].request,
-            "requesters": list(requesters_of(claims)),
-        }
-        # applications that it does not list, each with those that read its outputs
-        held_for = {
-            claim.subject.id: list(claim.application.held_for)
-            for claim in claims
-            if claim.is_on_application and claim.application.held_for
-        }
-        if held_for:
-            demands[demand]["held_for"] = held_for
-    return demands
-
-
-def _nodes(world: World) -> dict[str, dict[str, Json]]:
-    usage, config = whole_usage(world), world.config
-    nodes: dict[str, dict[str, Json]] = {}
-    # A machine that is in several access domains is one entry, because it has one capacity.
-    machines = {id: node for id, node in config.nodes.items() if id not in config.hosts}
-    for id, node in sorted(machines.items()):
-        names = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
-        limits = ((name, node.most(name)) for name in sorted(names))
-        resources = {
-            name: {
-                "requested": amount_text(usage.of(id, name), name),
-                "capacity": amount_text(most, name),
-            }
-            for name, most in limits
-            if most is not None
-        }
-        if resources:
-            nodes[id] = resources
-    return nodes
 
 
 def _sorted(topics: dict[str, set[str]]) -> _Requesters:

@@ -309,15 +309,6 @@ def _difference(listed: Connection, carrier: Connection, config: Config) -> str:
 # ---- a connection that does not suit the others ----
 
 
-def doubled(connection: Connection, ledger: Ledger) -> Iterator[tuple[int, str]]:
-    """Yield (index, id of the other connection) for each route that another one carries too."""
-    for index, route in enumerate(connection.topics):
-        holders = ledger.keys_with("route", *connection.key_of(route))
-        others = {key.subject.id for key in holders} - {connection.id}
-        if others:
-            yield index, min(others)
-
-
 def brought_twice(connection: Connection, ledger: Ledger) -> Iterator[tuple[int, str]]:
     """Yield (index, words) for each route to a topic that another route brings to the node too."""
     keys = [connection.key_of(route) for route in connection.topics]

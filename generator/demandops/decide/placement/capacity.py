@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from rpds import HashTrieMap
@@ -71,12 +72,10 @@ def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> di
 
 
 def _plan_leniently(world: World, keys: Iterable[ReleaseKey]) -> Plans:
-    planned: dict[ReleaseKey, Release | None] = {}
-    for key in keys:
-        try:
+    planned: dict[ReleaseKey, Release | None] = dict.fromkeys(keys)
+    for key in planned:
+        with suppress(Refused):  # a release that cannot be planned requests nothing
             planned[key] = plan(world, key)
-        except Refused:  # a release that cannot be planned requests nothing
-            planned[key] = None
     return planned
 
 
