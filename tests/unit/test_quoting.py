@@ -17,9 +17,10 @@ from demandops.base.strict_yaml import located_in
 from demandops.cli import output
 from demandops.cli.authoring import check
 from demandops.cli.json_output import print_json, show
-from demandops.cli.table import Column, Table
+from demandops.cli.table import Table
 from demandops.model.config.base_model import parse_file
 from demandops.model.ledger.records import _WaitingFile
+from demandops.views.rows import Column
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -77,7 +78,7 @@ def test_a_log_record_is_one_line_and_its_trace_is_indented(caplog: Any) -> None
 
 
 def test_commands_print_no_text_that_controls_a_terminal(capsys: Any) -> None:
-    table = Table([Column("Summary")], [[HOSTILE[:90]], [[HOSTILE[:90]]]])
+    table = Table([Column("", "Summary")], [[HOSTILE[:90]], [[HOSTILE[:90]]]])
     show("text", None, [HOSTILE[:90], table])
     output.errors.print(HOSTILE[:90])
     print_json({"summary": HOSTILE[:90]})

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from demandops.cli.table import Column, Table
+from demandops.cli.table import Table
+from demandops.views.rows import Column
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
 from tests.kit.chance import examples
 
-COLUMNS = Column("Name"), Column("State", 1), Column("Reason", 2), Column("Since", 3)
+NAMES = "Name", "State", "Reason", "Since"
+COLUMNS = [Column("", name, rank) for rank, name in enumerate(NAMES)]
 NAME = "of-edge-object-detection-fusion-cf7e0180a8bb"
 ROWS = [(NAME, "failing", "Helm install failed: timed out waiting", ["2h ago", "b"])]
 WORDS = st.text("abc 車-/", max_size=40)
@@ -43,7 +45,7 @@ def test_an_empty_table_says_so() -> None:
 @examples(80)
 def test_no_word_is_ever_cut(rows: list[tuple[str, str, list[str]]], width: int) -> None:
     """The first column is always shown whole. Another column is left out if it does not fit."""
-    columns = (Column("Name"), Column("State", 1), Column("Since", 2))
+    columns = (Column("", "Name"), Column("", "State", 1), Column("", "Since", 2))
     table = Table(columns, rows)
     shown = table.lines(width)
     told = " ".join(shown).split()

@@ -29,7 +29,7 @@ from demandops.repo.git import child_processes
 # the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.
 COMMANDS = {
     "approve": ("changes.approve", "Approve a proposal: merge its branch in your own name."),
-    "bookkeeping": ("queries.bookkeeping", "Show who requests which service and connection."),
+    "bookkeeping": ("queries.diff", "Show who requests which service and connection."),
     "check": ("authoring.check", "Check edits of a state repo and show their consequences."),
     "completion": ("program", "Print the completion script for a shell."),
     "config": ("program", "List, set and choose contexts: the fleets that you work with."),
@@ -45,7 +45,7 @@ COMMANDS = {
     "init": ("state_repo", "Create a state repo."),
     "journal": ("state_repo", "List the accepted demands that are not published."),
     "log": ("queries.log", "List the commits of the state repo, newest first."),
-    "may": ("queries.may", "Say whether a requester may demand an application, and why."),
+    "may": ("queries.why", "Say whether a requester may demand an application, and why."),
     "new": ("authoring.new", "Write a new application or image."),
     "override": ("changes.override", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
@@ -57,7 +57,7 @@ COMMANDS = {
         "Stop one demand, or an application for all who demand it.",
     ),
     "reconcile": (
-        "changes.reconcile",
+        "queries.status",
         "Let Flux or Argo CD fetch now, and not at its next interval.",
     ),
     "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),

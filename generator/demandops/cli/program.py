@@ -12,12 +12,14 @@ from click.shell_completion import get_completion_class
 
 from demandops import __version__
 from demandops.base import settings
+from demandops.base.runtime import REAL
 from demandops.cli import target
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import print_lines
-from demandops.cli.table import column, table_of
+from demandops.cli.table import table_of
 from demandops.cli.target import context_names
 from demandops.model.config.base_model import parse
+from demandops.views.rows import Column
 
 # ---- ``demandops version`` ----
 
@@ -116,14 +118,18 @@ def list_contexts(output: str) -> None:
     """
     data = target.read_contexts().model_dump(by_alias=True, include={"current", "contexts"})
     columns = (
-        column("", lambda context: "*" if context["name"] == data["current"] else ""),
-        column("Context", "name"),
-        column("State repo", "stateRepo"),
-        column("Clusters", "clusters", 1),
-        column("Signing key", "signingKey", 2),
+        Column("current", ""),
+        Column("name", "Context"),
+        Column("stateRepo", "State repo"),
+        Column("clusters", "Clusters", 1),
+        Column("signingKey", "Signing key", 2),
     )
-    contexts = [{"name": name, **context} for name, context in data["contexts"].items()]
-    table = table_of(columns, contexts, empty="no contexts; see demandops config set")
+    contexts = [
+        {"name": name, "current": "*" if name == data["current"] else "", **context}
+        for name, context in data["contexts"].items()
+    ]
+    empty = "no contexts; see demandops config set"
+    table = table_of(columns, contexts, REAL.now(), empty=empty)
     show(output, data, [table])
 
 

@@ -15,7 +15,8 @@ from rich.cells import cell_len
 
 from demandops.base.quoting import one_line
 from demandops.views.kinds import Kind
-from demandops.views.rows import TONES, Row, utc
+from demandops.views.rows import TONES, Column, Row, utc
+from demandops.views.vocabulary import Json
 
 _GAP = "  "
 # The smallest width, in characters, to which a column is narrowed by wrapping its text.
@@ -23,15 +24,6 @@ _GAP = "  "
 _COMFORT = 12
 
 Cell = str | Sequence[str]  # several texts are joined by commas
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    # One of rank 0 is never left out.
-    title: str
-    rank: int = 0
-    # Makes a cell of an item, and of what else the cells of a table need, such as the time.
-    cell_of: Callable[..., Cell] = str
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,29 +76,22 @@ class Table:
                 room -= more
         lines = [paint(line, "bold") for line in _laid_out(heads, shown, widths)]
         for row in rows:
-            lines += _laid_out(row, shown, widths, lambda text: paint(text, self._style(text)))
+            lines += _laid_out(
+                row, shown, widths, lambda text: paint(text, self.styles.get(text, ""))
+            )
         if left_out := [heads[at] for at in used if at not in shown]:
             note = f"more columns in a wider terminal: {', '.join(left_out)}"
             lines += [paint(line, "dim") for line in _wrapped(note, width)]
         return [*title, *lines]
 
-    def _style(self, text: str) -> str:
-        return self.styles.get(text, "")
-
-
-def column(title: str, cell: str | Callable[..., Cell], rank: int = 0) -> Column:
-    """Return a column; ``cell`` makes its cells, or is the key of a value to show."""
-    return Column(title, rank, cell if callable(cell) else lambda item, *_: item[cell] or "")
-
 
 def table_of(
     columns: Sequence[Column],
-    items: Iterable[Any],
-    *given: object,
+    items: Iterable[Json],
+    now: datetime,
     **more: Any,  # noqa: ANN401 - the other fields of a table
 ) -> Table:
-    rows = [[each.cell_of(item, *given) for each in columns] for item in items]
-    return Table(columns, rows, **more)
+    return Table(columns, [[each.texts(item, now) for each in columns] for item in items], **more)
 
 
 def _wrapped(text: str, width: int) -> list[str]:
@@ -147,7 +132,6 @@ STYLES = {word: _COLORS[tone] for word, tone in TONES.items()}
 
 def list_table(kind: Kind, rows: Sequence[Row], now: datetime, *, wide: bool = False) -> Table:
     columns = [column for column in kind.columns if wide or not column.only_wide]
-    heads = [Column(column.title, column.rank) for column in columns]
     cells = [[column.texts(row.item, now) for column in columns] for row in rows]
     if not wide:  # of long lists the beginning, so that most rows have one line
         cells = [
@@ -159,9 +143,9 @@ def list_table(kind: Kind, rows: Sequence[Row], now: datetime, *, wide: bool = F
             ]
             for row in cells
         ]
-    for at, column in enumerate(kind.columns if wide else ()):
+    for column in kind.columns if wide else ():
         if column.form == "time":  # and when that was by the clock
-            heads.append(Column(f"{column.title} (UTC)"))
+            columns.append(Column(column.key, f"{column.title} (UTC)"))
             for row, texts in zip(rows, cells, strict=True):
-                texts.append([utc(time)] if (time := row.item[columns[at].key]) else [])
-    return Table(heads, cells, empty=f"no {kind.name}", styles=STYLES, whole=wide)
+                texts.append([utc(time)] if (time := row.item[column.key]) else [])
+    return Table(columns, cells, empty=f"no {kind.name}", styles=STYLES, whole=wide)

@@ -418,7 +418,7 @@ class ConnectionType(ABC):
 
     @abstractmethod
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield why the type cannot link two nodes; the admission reports unknown nodes."""
+        """Yield why the type cannot link two nodes, which the inventory has."""
 
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config

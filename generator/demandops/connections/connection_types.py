@@ -26,7 +26,6 @@ def type_numbered(number: int) -> ConnectionType | None:
 
 
 def type_named(word: str) -> ConnectionType:
-    """Return the type that files call ``word``; raise ``KeyError`` if there is none."""
     return {kind.word: kind for kind in CONNECTION_TYPES}[word]
 
 
@@ -74,15 +73,15 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
 
 
 def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
-    # the admission reports unknown nodes
     ends = {"source": connection.source, "target": connection.target}
+    are_known = {*ends.values()} <= config.nodes.keys()  # the admission reports unknown nodes
     if kind.image not in config.images:
         message = f"{kind.name} needs an image '{kind.image}'; add it to "
         message += config.place_of(IMAGES_FILE)
         yield fault("type", message, code=UNSUPPORTED)
     if connection.broker and not kind.takes_broker:
         yield broker_fault("broker", kind)
-    if kind.speaks_dds and {*ends.values()} <= config.nodes.keys():
+    if kind.speaks_dds and are_known:
         for end, node in ends.items():
             if config.nodes[node].ros.rmw == "rmw_zenoh_cpp":
                 able = listed(other for other in CONNECTION_TYPES if not other.speaks_dds)
@@ -91,7 +90,7 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
                     f"{able}, or another rmw in {config.file_of(NODES_FILE, node)}"
                 )
                 yield fault(end, message, code=UNSUPPORTED)
-    yield from kind.link_faults(connection, config)
+    yield from kind.link_faults(connection, config) if are_known else ()
     yield from route_faults(kind, connection, config)
 
 

@@ -46,8 +46,6 @@ class Mqtt(ConnectionType):
             yield fault("images", message).within(configs.IMAGES_FILE)
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        if not {connection.source, connection.target} <= config.nodes.keys():
-            return
         if choose_broker(connection, config) is not None:
             return
         remedy = f"name one of: {', '.join(sorted(config.brokers))}"

@@ -30,8 +30,7 @@ class Ros(ConnectionType):
     needs_types = True
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        are_known = {connection.source, connection.target} <= config.nodes.keys()
-        if are_known and _listener(connection, config) is None:
+        if _listener(connection, config) is None:
             message = (
                 f"{self.name} needs an end with a reachable address; add 'wan: {{host: …}}' to "
                 f"'{connection.source}' or '{connection.target}' in {config.place_of(NODES_FILE)}"

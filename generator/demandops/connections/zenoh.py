@@ -40,9 +40,7 @@ class Zenoh(routes.ConnectionType):
                 ).within(file)
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        source, target = config.nodes.get(connection.source), config.nodes.get(connection.target)
-        if source is None or target is None:
-            return
+        source, target = (config.nodes[end] for end in connection.nodes)
         for end, node in (("source", source), ("target", target)):
             if node.zenoh is None:
                 message = (

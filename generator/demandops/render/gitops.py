@@ -140,25 +140,6 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
             "is 0, but an autoscaler keeps at least one replica; to run none, use 'deny' instead"
         )
         raise InvalidInput.at("replicas", message, file=by[-1])
-    variables = _variables(release, config)
-    patches = tuple(release.shaping.patches)
-    task = ValuesTask(template, variables, release.chart.folder, patches, variables["requests"])
-    try:
-        return evaluate(config.files, task)
-    except InvalidInput as error:
-        changing = {"version", "images", "replicas", "node"}
-        files = [override.path for override, effects in release.shaping.by if changing & {*effects}]
-        if not files:
-            raise
-        note = f" (overrides change what the template gets, so check {' and '.join(files)} too)"
-        faults = (
-            replace(fault, message=fault.message + note) if fault.file == template else fault
-            for fault in error.faults
-        )
-        raise type(error)(faults) from None
-
-
-def _variables(release: ServiceRelease, config: Config) -> dict[str, Any]:
     node = release.node
     variables: dict[str, Any] = {
         "release": release.name,
@@ -201,7 +182,21 @@ def _variables(release: ServiceRelease, config: Config) -> dict[str, Any]:
         variables["application"] = release.key.application
     elif release.key.source is not None:
         variables |= {"source": release.key.source, "source_topic": release.key.topic}
-    return variables
+    patches = tuple(release.shaping.patches)
+    task = ValuesTask(template, variables, release.chart.folder, patches, variables["requests"])
+    try:
+        return evaluate(config.files, task)
+    except InvalidInput as error:
+        changing = {"version", "images", "replicas", "node"}
+        files = [override.path for override, effects in release.shaping.by if changing & {*effects}]
+        if not files:
+            raise
+        note = f" (overrides change what the template gets, so check {' and '.join(files)} too)"
+        faults = (
+            replace(fault, message=fault.message + note) if fault.file == template else fault
+            for fault in error.faults
+        )
+        raise type(error)(faults) from None
 
 
 # ---- the file of a communication client: a Deployment, and a ConfigMap with its configuration ----

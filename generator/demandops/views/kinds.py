@@ -6,15 +6,20 @@ import json
 import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
 from itertools import islice
 from typing import Any
 
 from demandops.base.naming import SubjectKind
 from demandops.cluster.health import Health
-from demandops.cluster.release_status import ReleaseStatus
-from demandops.decide.bookkeeping import carried_topics, connection_entry, service_entry
+from demandops.cluster.rollouts import ReleaseStatus
+from demandops.decide.bookkeeping import (
+    carried_topics,
+    connection_entry,
+    service_entry,
+    versions_asked,
+)
 from demandops.decide.override_report import Entry
 from demandops.decide.planning.overrides import suspended_by
 from demandops.model.config.base_model import duration_text, parse_time, relative
@@ -116,13 +121,6 @@ STATE = Column("state", "State", 2, "state")
 SINCE = Column("since", "Since", 6, "time")
 
 
-def _ended(item: Json, now: datetime) -> str:
-    if not (ended := item.get("ended")):
-        return ""
-    how = f", {ended['operation']}" if ended["operation"] else ""
-    return f"{relative(parse_time(ended['time']), now)} by {ended['by']}{how}"
-
-
 def _lease_text(item: Json, now: datetime) -> str:
     if (lease := item.get("lease")) is None:
         return ""
@@ -137,7 +135,20 @@ def _lease_text(item: Json, now: datetime) -> str:
 
 
 LEASE = Column("lease", "Lease", 5, texts_of=_lease_text)
+
+
+def _ended(item: Json, now: datetime) -> str:
+    if not (ended := item.get("ended")):
+        return ""
+    how = f", {ended['operation']}" if ended["operation"] else ""
+    return f"{relative(parse_time(ended['time']), now)} by {ended['by']}{how}"
+
+
 ENDED = Column("ended", "Ended", 3, texts_of=_ended)
+
+
+def _named(kind: str) -> Column:
+    return Column("name", kind.capitalize(), links=kind)
 
 
 def _wide(key: str, title: str, links: str = "", texts_of: TextsOf | None = None) -> Column:
@@ -145,30 +156,29 @@ def _wide(key: str, title: str, links: str = "", texts_of: TextsOf | None = None
 
 
 def _command(title: str, words_of: Callable[[Json], list[str]]) -> Column:
-    return Column(
-        "name",
-        title,
-        9,
-        "command",
-        lambda item, now: shlex.join(words_of(item)),
-        only_wide=True,
-    )
+    def text(item: Json, now: datetime) -> str:
+        return shlex.join(words_of(item))
+
+    return Column("name", title, 9, "command", text, only_wide=True)
 
 
 def _decide(proposal: Json, verb: str) -> list[str]:
     return ["demandops", verb, proposal["name"], "--commit", proposal["commit"]]
 
 
-def _holds(item: Json, now: datetime) -> list[str]:
-    return [*item["applications"], *item["connections"]]
+HOLDS = Column(
+    "applications",
+    "Holds",
+    3,
+    texts_of=lambda item, now: [*item["applications"], *item["connections"]],
+    links="held",
+)
 
 
-HOLDS = Column("applications", "Holds", 3, texts_of=_holds, links="held")
-
-
-def _health(source: Source, releases: Iterable[str]) -> str | None:
-    # null if no cluster was asked
-    return worst_word(map(source.status, releases)) if source.statuses else None
+def _runs(source: Source, releases: list[str]) -> Json:
+    # the health is null if no cluster was asked
+    health = worst_word(map(source.status, releases)) if source.statuses else None
+    return {"releases": releases, "health": health}
 
 
 def domains_of(source: Source, nodes: Iterable[str]) -> list[str]:
@@ -227,46 +237,28 @@ def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
 def _demands(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     held = source.claims_of_demands.items()
     for id, claims in sorted(held, key=lambda pair: (min(c.booked for c in pair[1]), pair[0])):
-        releases = source.releases_of_demands.get(id, [])
-        yield id, (claims, _state(source, claims), releases, _health(source, releases))
+        runs = _runs(source, source.releases_of_demands.get(id, []))
+        yield id, (claims, _state(source, claims), runs)
     for waiting in source.state.ledger.waiting.values():
-        yield f"waiting {waiting.demand}", (waiting, "waiting", [], None)
+        yield f"waiting {waiting.demand}", (waiting, "waiting", {"releases": [], "health": None})
 
 
-def _demand(
-    source: Source,
-    holds: list[Claim] | WaitingDemand,
-    state: str,
-    releases: list[str],
-    health: str | None,
-) -> Json:
-    item: Json
+def _demand(source: Source, holds: list[Claim] | WaitingDemand, state: str, runs: Json) -> Json:
     if isinstance(holds, WaitingDemand):
-        item = {
-            "name": holds.demand,
-            "state": state,
-            "requests": [holds.put.id],
-            "requesters": list(holds.requesters),
-            "applications": [],
-            "connections": [],
-            "nodes": [],
-            "domains": [],
-            "since": time_data(holds.since),
-            "lease": None,
-            "suspended_by": [],
-            "ended": None,
-        }
-    else:
-        suspending = filter(None, (suspended_by(claim, source.state) for claim in holds))
-        item = {
-            "name": holds[0].demand,
-            **_held(source, holds, state),
-            "requests": sorted({claim.request for claim in holds}),
-            "applications": ids_of(holds, SubjectKind.APPLICATION),
-            "connections": ids_of(holds, SubjectKind.CONNECTION),
-            "suspended_by": sorted({override.path for override in suspending}),
-        }
-    return item | {"releases": releases, "health": health}
+        item: Json = {"name": holds.demand, "state": state, "requests": [holds.put.id]}
+        item |= {"requesters": list(holds.requesters), "applications": [], "connections": []}
+        item |= {"nodes": [], "domains": [], "since": time_data(holds.since), "lease": None}
+        return item | {"suspended_by": [], "ended": None, **runs}
+    suspending = filter(None, (suspended_by(claim, source.state) for claim in holds))
+    return {
+        "name": holds[0].demand,
+        **_held(source, holds, state),
+        "requests": sorted({claim.request for claim in holds}),
+        "applications": ids_of(holds, SubjectKind.APPLICATION),
+        "connections": ids_of(holds, SubjectKind.CONNECTION),
+        "suspended_by": sorted({override.path for override in suspending}),
+        **runs,
+    }
 
 
 def _leases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -289,17 +281,11 @@ def _applications(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
             releases[id].append(name)
     ledger = source.state.ledger
     for id in ledger.subjects(SubjectKind.APPLICATION):
-        claims, own = ledger.application_claims(id), releases[id]
-        yield id, (claims, _state(source, claims), own, _health(source, own))
+        claims = ledger.application_claims(id)
+        yield id, (claims, _state(source, claims), _runs(source, releases[id]))
 
 
-def _application(
-    source: Source,
-    claims: tuple[Claim, ...],
-    state: str,
-    releases: list[str],
-    health: str | None,
-) -> Json:
+def _application(source: Source, claims: tuple[Claim, ...], state: str, runs: Json) -> Json:
     app = claims[0].application
     return {
         "name": app.id,
@@ -308,8 +294,7 @@ def _application(
         "version": app.version or None,
         **_held(source, claims, state),
         "demands": [*dict.fromkeys(claim.demand for claim in claims)],
-        "releases": releases,
-        "health": health,
+        **runs,
     }
 
 
@@ -354,20 +339,11 @@ def _requesters(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
             }
         )
         state = _state(source, claims) if claims else "waiting"
-        yield (
-            requester,
-            (requester, claims, state, waiting[requester], releases, _health(source, releases)),
-        )
+        yield requester, (requester, claims, state, waiting[requester], _runs(source, releases))
 
 
 def _requester(
-    source: Source,
-    name: str,
-    claims: list[Claim],
-    state: str,
-    waiting: list[str],
-    releases: list[str],
-    health: str | None,
+    source: Source, name: str, claims: list[Claim], state: str, waiting: list[str], runs: Json
 ) -> Json:
     held: Json = {"state": state, "nodes": [], "domains": [], "since": None, "lease": None}
     return {
@@ -376,8 +352,7 @@ def _requester(
         "demands": sorted({*waiting, *(claim.demand for claim in claims)}),
         "applications": ids_of(claims, SubjectKind.APPLICATION),
         "connections": ids_of(claims, SubjectKind.CONNECTION),
-        "releases": releases,
-        "health": health,
+        **runs,
         "requesters": [name],
     }
 
@@ -393,18 +368,26 @@ def _releases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 
 def _services(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    for name, values in _releases(source):
-        if isinstance(values[0], ServiceRelease):
-            yield name, values
+    yield from (each for each in _releases(source) if isinstance(each[1][0], ServiceRelease))
 
 
 def _release(
     source: Source, release: Release, claims: list[Claim], status: ReleaseStatus | None
 ) -> Json:
+    own: Json
     if isinstance(release, ServiceRelease):
-        own = service_entry(source.active, release)
+        own = {
+            "version": release.chart.version,
+            "application_version": release.version.name or None,
+            "versions_asked": versions_asked(release, source.active.ledger),
+            **service_entry(source.active, release),
+        }
     else:
-        own = {"service": None, "applications": [], "connections": list(release.connections)}
+        own = {"version": None, "application_version": None, "versions_asked": {}}
+        own |= {"service": None, "applications": [], "connections": list(release.connections)}
+    # what a cluster says of it; null if none was asked
+    word = word_of(status) if status else None
+    status = status or ReleaseStatus(Health("waiting"))
     return {
         **vocabulary.release_data(release),
         "type": release.node.type,
@@ -412,19 +395,7 @@ def _release(
         "connections": [],
         "requesters": list(requesters_of(claims)),
         "demands": [*dict.fromkeys(claim.demand for claim in claims)],
-        **vocabulary.version_data(release, source.active.ledger),
         **own,
-        **status_data(status),
-    }
-
-
-def status_data(status: ReleaseStatus | None) -> Json:
-    """Return what a cluster says of a release; null if none was asked."""
-    if status is None:
-        status, word = ReleaseStatus(Health("waiting")), None
-    else:
-        word = word_of(status)
-    return {
         "seen": status.seen or None,
         "health": word,
         "since": time_data(since_of(status)),
@@ -442,12 +413,10 @@ def _connections(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
                 clients_of[id].append(name)
     for id in ledger.subjects(SubjectKind.CONNECTION):
         if claims := ledger.connection_claims(id):  # that are not suspended
-            yield id, (claims, clients_of[id], _health(source, clients_of[id]))
+            yield id, (claims, _runs(source, clients_of[id]))
 
 
-def _connection(
-    source: Source, claims: tuple[Claim, ...], releases: list[str], health: str | None
-) -> Json:
+def _connection(source: Source, claims: tuple[Claim, ...], runs: Json) -> Json:
     entry = connection_entry(claims)
     nodes = [entry["source"], entry["target"]]
     return {
@@ -456,8 +425,7 @@ def _connection(
         "nodes": nodes,
         "domains": domains_of(source, nodes),
         "demands": [*dict.fromkeys(claim.demand for claim in claims)],
-        "releases": releases,
-        "health": health,
+        **runs,
     }
 
 
@@ -481,8 +449,7 @@ def _parameters(item: Json, now: datetime) -> list[str]:
     return [f"{name} = {value}" for name, value in item["parameters"].items()]
 
 
-def version_texts(item: Json, *_: object) -> list[str]:
-    # of what `vocabulary.version_data` returns
+def _versions(item: Json, now: datetime) -> list[str]:
     asked = item["versions_asked"].items()
     return [
         item["application_version"] or item["version"] or "",
@@ -508,12 +475,10 @@ def _nodes(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
             needing[id].append(claim)
     # A claim may need a node that a person removed from the inventory.
     for id in sorted({*source.config.nodes, *needing}):
-        yield id, (id, needing[id], sorted(running[id]), _health(source, running[id]))
+        yield id, (id, needing[id], _runs(source, sorted(running[id])))
 
 
-def _node(
-    source: Source, id: str, claims: list[Claim], releases: list[str], health: str | None
-) -> Json:
+def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
     node, domain = source.config.nodes.get(id), source.config.domain_of.get(id)
     state = "open" if node else "not in the inventory"
     return {
@@ -526,12 +491,12 @@ def _node(
         "capabilities": list(node.capabilities) if node else [],
         "properties": dict(node.properties) if node else {},
         "position": node.position.model_dump() if node and node.position else None,
-        "releases": releases,
+        "releases": runs["releases"],
         "applications": ids_of(claims, SubjectKind.APPLICATION),
         "connections": ids_of(claims, SubjectKind.CONNECTION),
         "demands": sorted({claim.demand for claim in claims}),
         "requesters": list(requesters_of(claims)),
-        "health": health,
+        "health": runs["health"],
     }
 
 
@@ -608,7 +573,7 @@ def effect_texts(override: Json, *_: object) -> list[str]:
 
 def _affected(item: Json, now: datetime) -> list[str]:
     releases = dict.fromkeys(release["name"] for release in item["releases"])
-    return [*releases, *dict.fromkeys(subject_text(claim) for claim in item["claims"])]
+    return [*releases, *dict.fromkeys(map(subject_text, item["claims"]))]
 
 
 def _proposals(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -636,16 +601,12 @@ def _told(commit: Json, now: datetime) -> str:
     return f"{commit['summary']}{f'; {vocabulary.decision_text(decision)}' if decision else ''}"
 
 
-_RELEASE = Column("name", "Release", links="release")
 _NODE = Column("node", "Node", 3, links="node")
-_VERSION = Column("version", "Version", 7, texts_of=version_texts)
+_VERSION = Column("version", "Version", 7, texts_of=_versions)
 _CLUSTER = Column("cluster", "Cluster", 8)
-_SEEN = Column("seen", "Seen", 9, texts_of=lambda item, now: (item["seen"] or "")[:10])
+_COMMIT = Column("commit", "Commit", texts_of=lambda item, now: item["commit"][:10])
 _FOR = Column(
-    "applications",
-    "For",
-    5,
-    texts_of=lambda item, now: item["applications"] or item["connections"],
+    "applications", "For", 5, texts_of=lambda item, now: item["applications"] or item["connections"]
 )
 
 KINDS: dict[str, Kind] = {
@@ -655,16 +616,8 @@ KINDS: dict[str, Kind] = {
             "demands",
             "What requesters hold, until they release it or its lease ends.",
             (
-                Column("name", "Demand", links="demand"),
-                STATE,
-                HEALTH,
-                ENDED,
-                REQUESTERS,
-                HOLDS,
-                LEASE,
-                SINCE,
-                _wide("requests", "Requests"),
-                _wide("nodes", "Nodes", "node"),
+                *(_named("demand"), STATE, HEALTH, ENDED, REQUESTERS, HOLDS, LEASE, SINCE),
+                *(_wide("requests", "Requests"), _wide("nodes", "Nodes", "node")),
                 _wide("suspended_by", "Suspended by"),
             ),
             _demands,
@@ -675,16 +628,9 @@ KINDS: dict[str, Kind] = {
             "applications",
             "What is held, each once, however many demands hold it.",
             (
-                Column("name", "Application", links="application"),
-                STATE,
-                HEALTH,
-                ENDED,
-                Column("appdef", "Type", 3),
-                Column("node", "Node", 4, links="node"),
-                REQUESTERS,
-                Column("version", "Version", 7),
-                SINCE,
-                _wide("demands", "Demands", "demand"),
+                *(_named("application"), STATE, HEALTH, ENDED, Column("appdef", "Type", 3)),
+                *(Column("node", "Node", 4, links="node"), REQUESTERS),
+                *(Column("version", "Version", 7), SINCE, _wide("demands", "Demands", "demand")),
                 _wide("releases", "Releases", "release"),
             ),
             _applications,
@@ -696,16 +642,9 @@ KINDS: dict[str, Kind] = {
             "releases",
             "Helm releases and the clients of connections, each shared by all who need it.",
             (
-                _RELEASE,
-                HEALTH,
-                Column("reason", "Reason", 1, texts_of=_reason),
-                _NODE,
-                Column("requesters", "Requesters", 4, links="requester"),
-                _FOR,
-                Column("since", "Since", 6, "time"),
-                _VERSION,
-                _CLUSTER,
-                _SEEN,
+                *(_named("release"), HEALTH, Column("reason", "Reason", 1, texts_of=_reason)),
+                *(_NODE, replace(REQUESTERS, rank=4), _FOR, SINCE, _VERSION, _CLUSTER),
+                Column("seen", "Seen", 9, texts_of=lambda item, now: (item["seen"] or "")[:10]),
             ),
             _releases,
             _release,
@@ -714,20 +653,14 @@ KINDS: dict[str, Kind] = {
             "services",
             "Releases of services, one for each service on a node, shared by all who need it.",
             (
-                _RELEASE,
-                HEALTH,
-                Column("service", "Service", 6),
-                _NODE,
-                REQUESTERS,
+                *(_named("release"), HEALTH, Column("service", "Service", 6), _NODE, REQUESTERS),
                 Column(
                     "source",
                     "For",
                     5,
                     texts_of=lambda item, now: item["source"] or item["applications"],
                 ),
-                _VERSION,
-                _CLUSTER,
-                _wide("inputs", "Takes in", texts_of=_inputs),
+                *(_VERSION, _CLUSTER, _wide("inputs", "Takes in", texts_of=_inputs)),
                 _wide("parameters", "Parameters", texts_of=_parameters),
             ),
             _services,
@@ -738,12 +671,9 @@ KINDS: dict[str, Kind] = {
             "connections",
             "Topics that are carried from one node to another.",
             (
-                Column("name", "Connection", links="connection"),
-                HEALTH,
-                Column("type", "Type", 4),
+                *(_named("connection"), HEALTH, Column("type", "Type", 4)),
                 Column("source", "From", 2, links="node"),
-                Column("target", "To", 2, links="node"),
-                REQUESTERS,
+                *(Column("target", "To", 2, links="node"), REQUESTERS),
                 Column("topics", "Topics", 5, texts_of=_topics),
                 _wide("releases", "Releases", "release"),
             ),
@@ -760,11 +690,8 @@ KINDS: dict[str, Kind] = {
             "leases",
             "Demands that end unless their requester renews them. The first to end comes first.",
             (
-                Column("name", "Demand", links="demand"),
-                Column("lease", "Ends", 1, texts_of=_ends),
-                REQUESTERS,
-                Column("term", "Term", 3, texts_of=_term),
-                HOLDS,
+                *(_named("demand"), Column("lease", "Ends", 1, texts_of=_ends), REQUESTERS),
+                *(Column("term", "Term", 3, texts_of=_term), HOLDS),
             ),
             _leases,
             _demand,
@@ -774,17 +701,12 @@ KINDS: dict[str, Kind] = {
             "nodes",
             "The machines of the inventory, and what needs each of them.",
             (
-                Column("name", "Node", links="node"),
-                STATE,
-                HEALTH,
-                Column("type", "Type", 3),
-                Column("domain", "Domain", 4),
-                Column("cluster", "Cluster", 6),
+                *(_named("node"), STATE, HEALTH, Column("type", "Type", 3)),
+                *(Column("domain", "Domain", 4), Column("cluster", "Cluster", 6)),
                 Column(
                     "releases", "Releases", 5, texts_of=lambda item, now: str(len(item["releases"]))
                 ),
-                REQUESTERS,
-                _wide("capabilities", "Capabilities"),
+                *(REQUESTERS, _wide("capabilities", "Capabilities")),
                 _wide("properties", "Properties", texts_of=_properties),
             ),
             _nodes,
@@ -794,14 +716,8 @@ KINDS: dict[str, Kind] = {
             "requesters",
             "Who demands something, and what each holds.",
             (
-                Column("name", "Requester", links="requester"),
-                STATE,
-                HEALTH,
-                ENDED,
-                Column("demands", "Demands", 3, links="demand"),
-                HOLDS,
-                LEASE,
-                SINCE,
+                *(_named("requester"), STATE, HEALTH, ENDED),
+                *(Column("demands", "Demands", 3, links="demand"), HOLDS, LEASE, SINCE),
                 _wide("nodes", "Nodes", "node"),
             ),
             _requesters,
@@ -812,14 +728,10 @@ KINDS: dict[str, Kind] = {
             "domains",
             "Access domains: nodes of one owner, and what the policy says about them.",
             (
-                Column("name", "Domain"),
-                Column("approval", "Approval", 2),
-                Column("when_full", "When full", 5),
-                Column("namespace", "Namespace", 4),
-                Column("clusters", "Clusters", 3),
-                Column("nodes", "Nodes", 1, links="node"),
-                Column("rules", "Rules", 6),
-                _wide("file", "File"),
+                *(Column("name", "Domain"), Column("approval", "Approval", 2)),
+                *(Column("when_full", "When full", 5), Column("namespace", "Namespace", 4)),
+                *(Column("clusters", "Clusters", 3), Column("nodes", "Nodes", 1, links="node")),
+                *(Column("rules", "Rules", 6), _wide("file", "File")),
             ),
             _domains,
         ),
@@ -827,11 +739,9 @@ KINDS: dict[str, Kind] = {
             "appdefs",
             "Application definitions: the types of application that can be demanded.",
             (
-                Column("name", "Type"),
-                Column("services", "Services", 1),
+                *(Column("name", "Type"), Column("services", "Services", 1)),
                 Column("applications", "Applications", 2, links="application"),
-                Column("charts", "Charts", 3),
-                _wide("file", "File"),
+                *(Column("charts", "Charts", 3), _wide("file", "File")),
             ),
             _appdefs,
         ),
@@ -839,14 +749,9 @@ KINDS: dict[str, Kind] = {
             "claims",
             "What one demand holds of one subject.",
             (
-                Column("subject", "Subject", texts_of=_subject),
-                STATE,
-                REQUESTERS,
-                Column("demand", "Demand", 3, links="demand"),
-                LEASE,
-                SINCE,
-                _wide("request", "Request"),
-                _wide("file", "File"),
+                *(Column("subject", "Subject", texts_of=_subject), STATE, REQUESTERS),
+                *(Column("demand", "Demand", 3, links="demand"), LEASE, SINCE),
+                *(_wide("request", "Request"), _wide("file", "File")),
             ),
             _claims,
             _claim,
@@ -859,22 +764,19 @@ KINDS: dict[str, Kind] = {
             "overrides",
             "What runs otherwise than demanded, and why.",
             (
-                Column("name", "Override", links="override"),
-                STATE,
-                Column("effects", "Does", 2, texts_of=effect_texts),
-                Column("until", "Until", 3, "time"),
-                Column("owner", "Owner", 4),
-                Column("releases", "To", 5, texts_of=_affected),
-                Column("reason", "Reason", 6),
+                *(_named("override"), STATE, Column("effects", "Does", 2, texts_of=effect_texts)),
+                *(Column("until", "Until", 3, "time"), Column("owner", "Owner", 4)),
+                *(Column("releases", "To", 5, texts_of=_affected), Column("reason", "Reason", 6)),
                 _wide("priority", "Priority"),
                 _command("End it", lambda item: ["demandops", "override", "end", item["name"]]),
             ),
             _overrides,
             _override,
             lambda item: {
-                "node": [release["node"] for release in item["releases"]],
-                "domain": [release["domain"] for release in item["releases"]],
-                "cluster": [release["cluster"] for release in item["releases"]],
+                **{
+                    key: [release[key] for release in item["releases"]]
+                    for key in ("node", "domain", "cluster")
+                },
                 "release": [release["name"] for release in item["releases"]],
                 "requester": [who for claim in item["claims"] for who in claim["requesters"]],
                 "demand": [claim["demand"] for claim in item["claims"]],
@@ -884,13 +786,9 @@ KINDS: dict[str, Kind] = {
             "proposals",
             "Changes that a person approves by merging a branch, or refuses by deleting it.",
             (
-                Column("name", "Branch"),
-                Column("commit", "Commit", texts_of=lambda item, now: item["commit"][:10]),
-                REQUESTERS,
-                Column("since", "Since", 3, "time"),
-                Column("summary", "What", 1),
-                Column("required_by", "Required by", 4),
-                Column("link", "Link", 5),
+                *(Column("name", "Branch"), _COMMIT, REQUESTERS),
+                *(Column("since", "Since", 3, "time"), Column("summary", "What", 1)),
+                *(Column("required_by", "Required by", 4), Column("link", "Link", 5)),
                 _wide("demands", "Demands", "demand"),
                 _command("See", lambda item: ["git", "diff", f"origin/main...{item['commit']}"]),
                 _command("Approve", lambda item: _decide(item, "approve")),
@@ -902,10 +800,8 @@ KINDS: dict[str, Kind] = {
             "events",
             "The newest commits, by demands, people and the generator.",
             (
-                Column("time", "When", 0, "time"),
-                Column("commit", "Commit", 0, texts_of=lambda item, now: item["commit"][:10]),
-                Column("summary", "What", 1, texts_of=_told),
-                Column("who", "Who", 2),
+                *(Column("time", "When", 0, "time"), _COMMIT),
+                *(Column("summary", "What", 1, texts_of=_told), Column("who", "Who", 2)),
                 Column("operation", "Operation", 3, only_wide=True),
                 Column("author", "Author", 3, only_wide=True),
                 _wide("request", "Request"),

@@ -17,6 +17,7 @@ from demandops.model.release import ServiceRelease
 from demandops.views.kinds import rows_of
 from demandops.views.rows import Filter, Row, exactly
 from demandops.views.source import RANKS, WORDS, Source, word_of
+from demandops.views.vocabulary import Json
 
 # A drawing for wide screens and one for phones, of which the style sheet shows one: its width, the
 # widths of its large and of its small cards, the least gap between them, and above how many nodes
@@ -109,17 +110,6 @@ class Card:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
-    """A connection, as the map shows it."""
-
-    ends: tuple[str, ...]  # its nodes
-    name: str
-    topics: int
-    word: str  # its health
-    is_lit: bool
-
-
-@dataclass(frozen=True, slots=True)
 class Line:
     path: str
     tone: str
@@ -139,12 +129,11 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
         layout = "place" if len(spots) > len(nodes) / 2 else "cluster"
 
     lit, lit_releases = set[str](), set[str]()  # a node is lit with a service or connection of it
-    links, peers = list[Link](), defaultdict[str, set[str]](set)
+    links, peers = list[tuple[Json, bool]](), defaultdict[str, set[str]](set)
     for row in rows_of(source, "connections"):
-        if known.keys() >= {*(ends := tuple(row.item["nodes"]))}:
+        if known.keys() >= {*(ends := row.item["nodes"])}:
             is_lit = bool(wanted) and wanted.matches(row)
-            word, topics = row.item["health"] or "unknown", len(row.item["topics"])
-            links.append(Link(ends, row.item["name"], topics, word, is_lit))
+            links.append((row.item, is_lit))
             peers[ends[0]].add(ends[1])
             peers[ends[1]].add(ends[0])
             if is_lit:
@@ -180,8 +169,8 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     drawings = []
     for name, (width, large, small, gap, most) in _DRAWINGS.items():
         used_spots = spots if layout == "place" else {}
-        groups = _groups(nodes, peers, lit, used_spots, most)
-        drawing = Drawing(name, width, [_card(*group, marks, lit) for group in groups])
+        cards = [*_cards(nodes, marks, peers, lit, used_spots, most)]
+        drawing = Drawing(name, width, cards)
         drawing.place(large if len(drawing.cards) <= _MOST_LARGE else small, gap, peers, used_spots)
         drawing.connect(links, chosen, is_filtered=bool(wanted))
         drawings.append(drawing)
@@ -223,19 +212,17 @@ def _cell(spot: Spot) -> str:
     return "/".join(str(_step(part)) for part in spot)
 
 
-def _groups(
+def _cards(
     nodes: Iterable[Node],
+    marks: Mapping[str, list[Mark]],
     peers: Mapping[str, set[str]],
     lit: set[str],
     spots: Mapping[str, Spot],
     most: int,
-) -> Iterator[tuple[list[Node], str]]:
-    """Yield the nodes of each card, with the filter that chooses them.
-
-    If there are too many nodes of a type, those that are connected with the same nodes form a
-    stack: the vehicles of an edge. If there are still too many, those of a cluster do; else all do.
-    By position, those in one part of the map do.
-    """
+) -> Iterator[Card]:
+    # If there are too many nodes of a type, those that are connected with the same nodes form a
+    # stack: the vehicles of an edge. If there are still too many, those of a cluster do; else all
+    # do. By position, those in one part of the map do.
     near = {peer for id in lit for peer in peers[id]}
     alike: dict[tuple[str, bool, bool, bool], list[Node]] = {}
     for node in nodes:
@@ -257,20 +244,17 @@ def _groups(
                 query = " ".join(parts[: level if level < 3 else None])
                 stacks.setdefault(query, []).append(node)
         for query, stack in stacks.items():
-            yield stack, exactly("node", stack[0].id) if len(stack) == 1 else query
-
-
-def _card(nodes: list[Node], query: str, marks: Mapping[str, list[Mark]], lit: set[str]) -> Card:
-    own = marks[nodes[0].id]
-    if len(nodes) > 1:
-        own = [Mark(node.id, _tone(marks[node.id]), True, False) for node in nodes]
-    # where nothing is lit by itself, all is lit with the card
-    is_some_lit = any(mark.is_lit for mark in own)
-    own = sorted(
-        (replace(mark, is_lit=mark.is_lit or not is_some_lit) for mark in own),
-        key=lambda m: (not m.is_lit, _WORST_FIRST.index(m.tone), not m.is_service, m.text),
-    )
-    return Card(nodes, nodes[0].id in lit, query, own, _tone(own))
+            first, own = stack[0], marks[stack[0].id]
+            if len(stack) > 1:
+                own = [Mark(node.id, _tone(marks[node.id]), True, False) for node in stack]
+            # where nothing is lit by itself, all is lit with the card
+            is_some_lit = any(mark.is_lit for mark in own)
+            own = sorted(
+                (replace(mark, is_lit=mark.is_lit or not is_some_lit) for mark in own),
+                key=lambda m: (not m.is_lit, _WORST_FIRST.index(m.tone), not m.is_service, m.text),
+            )
+            choice = query if len(stack) > 1 else exactly("node", first.id)
+            yield Card(stack, first.id in lit, choice, own, _tone(own))
 
 
 # ---- the drawing: where the cards stand, and the lines between them ----
@@ -298,18 +282,16 @@ class Drawing:
     def place(
         self, across: float, gap: float, peers: Mapping[str, set[str]], spots: Mapping[str, Spot]
     ) -> None:
-        def row_of(card: Card) -> tuple[bool, int, str]:
-            node = card.nodes[0]
-            if node.id in spots:
-                return False, _step(spots[node.id][1]), ""
-            return True, (*_TYPES, node.type).index(node.type), node.type
-
         by_row: dict[tuple[bool, int, str], list[Card]] = {}
         for card in self.cards:
             listed = min(len(card.marks), _MOST_LISTED + 1)
             card.is_large = len(self.cards) <= _MOST_LARGE and not card.is_stack
             card.width, card.height = across, 44.0 + 15.0 * listed if card.is_large else 58.0
-            by_row.setdefault(row_of(card), []).append(card)
+            node = card.nodes[0]
+            place = True, (*_TYPES, node.type).index(node.type), node.type
+            if node.id in spots:
+                place = False, _step(spots[node.id][1]), ""
+            by_row.setdefault(place, []).append(card)
         columns = max(1, int((self.width - gap) // (across + gap)))
         middles: dict[str, float] = {}  # of the card of each node that is placed
         y = 6.0
@@ -327,8 +309,8 @@ class Drawing:
             parts = -(-len(cards) // columns)
             for row in (cards[part::parts] for part in range(parts)):
                 free, left, right = (self.width - across * len(row)) / (len(row) + 1), gap, 0.0
-                for place, card in enumerate(row):
-                    even = free * (place + 1) + across * place
+                for number, card in enumerate(row):
+                    even = free * (number + 1) + across * number
                     card.x = even if is_by_type else max(left, wishes[id(card)] - across / 2)
                     card.y, card.row, left = y, len(self.rows), card.x + across + gap
                 right = self.width
@@ -342,35 +324,39 @@ class Drawing:
                 y = self.rows[-1][1] + _CHANNEL
         self.height = y - _CHANNEL * 0.4
 
-    def connect(self, links: Iterable[Link], chosen: set[str], *, is_filtered: bool) -> None:
+    def connect(
+        self, links: Iterable[tuple[Json, bool]], chosen: set[str], *, is_filtered: bool
+    ) -> None:
+        # ``links`` are connections as rows, each with whether the filter finds it
         card_of = {node.id: card for card in self.cards for node in card.nodes}
-        between: dict[tuple[int, int], tuple[Card, Card, list[Link]]] = {}
+        between: dict[tuple[int, int], tuple[Card, Card, list[tuple[Json, bool]]]] = {}
         for link in links:
-            ends = (card_of[id] for id in link.ends)
+            ends = (card_of[id] for id in link[0]["nodes"])
             upper, lower = sorted(ends, key=lambda card: (card.row, card.x))
             if upper is not lower:
                 pair = between.setdefault((id(upper), id(lower)), (upper, lower, []))
                 pair[2].append(link)
-        for upper, lower, carried in between.values():
-            is_lit = any(link.is_lit or not chosen.isdisjoint(link.ends) for link in carried)
-            worst = min((link.word for link in carried), key=RANKS.__getitem__)
+        for upper, lower, pairs in between.values():
+            is_lit = any(found or not chosen.isdisjoint(link["nodes"]) for link, found in pairs)
+            carried = [link for link, _ in pairs]
+            worst = min((link["health"] or "unknown" for link in carried), key=RANKS.__getitem__)
             if is_filtered and not is_lit:
                 continue
             is_late = WORDS[worst] in ("bad", "busy")
             if len(between) > _MOST_LINES and not (is_lit or is_late):
                 self.is_cut = True
                 continue
-            names = ", ".join(link.name for link in carried[:3])
+            names = ", ".join(link["name"] for link in carried[:3])
             names += f" and {len(carried) - 3} more" if len(carried) > 3 else ""
-            topics = sum(link.topics for link in carried)
+            topics = sum(len(link["topics"]) for link in carried)
             title = f"{upper.label} and {lower.label}: {names}; {topics} topics; {worst}"
             singles = [card for card in (upper, lower) if not card.is_stack]
             query = " ".join(exactly("node", card.nodes[0].id) for card in singles)
-            line = Line(self._path(upper, lower), WORDS[worst], is_lit, query, title)
-            self.lines.append(line)
+            path = self._path(upper, lower)
+            self.lines.append(Line(path, WORDS[worst], is_lit, query, title))
 
     def _path(self, upper: Card, lower: Card) -> str:
-        """Return a path that goes down through a gap between the cards of each row on its way."""
+        # it goes down through a gap between the cards of each row on its way
         x, y, end = upper.middle, self.rows[upper.row][1], lower.middle
         path = f"M{x:.1f} {upper.bottom:.1f}V{y:.1f}"
         if upper.row == lower.row:  # in an arc below both

@@ -13,65 +13,20 @@ from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.object_cache import object_caches
+from demandops.cluster.watches import object_caches
 from demandops.repo.git.repository import reading
 from demandops.repo.load.snapshot import Progress
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.views.source import Commit, HealthChange, Source, word_of
 
-# ---- the releases on their clusters, and the changes of their health ----
-
-# How many changes of health are kept. They are in memory only, because the page writes nothing.
-_KEPT = 2_000
-
-
-class ClusterWatch:
-    # only one thread at a time may use a watch, but any thread may read `changes`
-    def __init__(
-        self, clusters: Mapping[str, ClusterAccess], on_change: Callable[[], None]
-    ) -> None:
-        self._caches = object_caches(clusters, on_change, REAL)
-        self.clusters = frozenset(self._caches)
-        self._seen: dict[str, str] = {}  # the word for the health of each release
-        self._changes = deque[HealthChange](maxlen=_KEPT)
-
-    @property
-    def changes(self) -> tuple[HealthChange, ...]:
-        # any thread may read this; to iterate would fail if the follower appended meanwhile
-        return tuple(self._changes.copy())
-
-    def with_reports(self, source: Source, reader: Reader) -> Source:
-        for cluster, objects in source.watched_objects.items():
-            if cluster in self._caches:
-                self._caches[cluster].watch(objects)
-        # Health is judged by the file that the cluster has applied. Judged by the newest commit,
-        # everything would be `waiting` for seconds after each commit.
-        repository = reader.repository
-        source = source.with_reports(self._caches, repository, repository.changed_paths)
-        for name, status in source.statuses.items():
-            before, after = self._seen.get(name, ""), word_of(status)
-            self._seen[name] = after
-            if before and before != after:  # the first health that a cluster reports is no change
-                reason = status.health.reason
-                self._changes.append(HealthChange(REAL.now(), name, before, after, reason))
-        self._seen = {name: self._seen[name] for name in source.statuses}
-        return source
-
-    def close(self) -> None:
-        for cache in self._caches.values():
-            cache.close()
-
-
-# ---- the state repo, and its newest commits ----
-#
-# One thread fetches new commits and publishes each new situation. The threads that answer requests
-# read the published situation.
-
 log = logging.getLogger("demandops")
 
 # How many of the newest commits the time line shows.
 MOST_COMMITS = 5_000
+
+# How many changes of health are kept. They are in memory only, because the page writes nothing.
+_MOST_CHANGES = 2_000
 
 # The pause in seconds between checks of a local repository, which cost little.
 _LOOK_S = 0.2
@@ -83,6 +38,9 @@ _MOST_EARLIER = 8
 
 
 class Follower:
+    # One thread fetches new commits and publishes each new situation. The threads that answer
+    # requests read the published situation.
+
     def __init__(
         self,
         reader: Reader,
@@ -98,7 +56,9 @@ class Follower:
         self._interval = _LOOK_S if reader.repository.always_current else interval or None
         self._wake, self.closed = REAL.event(), REAL.event()
         self._push_denied = push_denied
-        self._watch = ClusterWatch(clusters, self._wake.set)
+        self._caches = object_caches(clusters, self._wake.set, REAL)
+        self._words: dict[str, str] = {}  # for the health of each release, as last seen
+        self._changes = deque[HealthChange](maxlen=_MOST_CHANGES)
         self._earlier: dict[str, Source] = {}
         self._loading = REAL.lock()
         # Browsers fetch the page again when this number changes.
@@ -115,10 +75,8 @@ class Follower:
 
     @property
     def health_changes(self) -> tuple[HealthChange, ...]:
-        return self._watch.changes
-
-    def reader(self) -> Reader:
-        return self._reader.for_another_thread()
+        # to iterate would fail if the follower's thread appended meanwhile
+        return tuple(self._changes.copy())
 
     def reading(self) -> AbstractContextManager[None]:
         # raises StateRepoError if an object is missing or damaged
@@ -129,7 +87,7 @@ class Follower:
         newest = self.newest
         if not revision:
             return newest
-        reader = self.reader()
+        reader = self._reader.for_another_thread()
         commit = reader.commit(revision)
         if commit == newest.commit:
             return newest
@@ -150,7 +108,8 @@ class Follower:
         self.closed.set()
         self._wake.set()
         self._thread.join()
-        self._watch.close()
+        for cache in self._caches.values():
+            cache.close()
         self._reader.close()
 
     def _run(self) -> None:
@@ -180,7 +139,7 @@ class Follower:
                 self.closed.wait(min(1.0, _PAUSE_FACTOR * (REAL.monotonic() - began)))
 
     def _with_reports(self, source: Source) -> Source:
-        watch, repository, commit = self._watch, self._reader.repository, source.commit
+        repository, commit = self._reader.repository, source.commit
         last = self.history[0].entry.commit if self.history else ""
         if commit != last:
             new, before = None, self.history
@@ -194,9 +153,24 @@ class Follower:
         source = replace(
             source,
             now=REAL.now(),
-            watched=watch.clusters,
+            watched=frozenset(self._caches),
             proposals=tuple(pending_proposals(repository)),
             unread="",
             push_denied="",
         )
-        return watch.with_reports(source, self._reader) if watch.clusters else source
+        if not self._caches:
+            return source
+        for cluster, objects in source.watched_objects.items():
+            if cluster in self._caches:
+                self._caches[cluster].watch(objects)
+        # Health is judged by the file that the cluster has applied. Judged by the newest commit,
+        # everything would be `waiting` for seconds after each commit.
+        source = source.with_reports(self._caches, repository, repository.changed_paths)
+        words = {name: word_of(status) for name, status in source.statuses.items()}
+        for name, after in words.items():
+            earlier = self._words.get(name)
+            if earlier and earlier != after:  # the first health that a cluster reports is no change
+                reason = source.statuses[name].health.reason
+                self._changes.append(HealthChange(REAL.now(), name, earlier, after, reason))
+        self._words = words
+        return source

@@ -1,16 +1,14 @@
-"""The page: its addresses, its views and its server."""
+"""The page's site and its server."""
 
 from __future__ import annotations
 
 import logging
 import shlex
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable
 from datetime import timezone
-from itertools import islice
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlencode
 
 import anyio
 from anyio import to_thread
@@ -33,156 +31,10 @@ from demandops.base.quoting import escaped, lines
 from demandops.model.config.base_model import parse_time, relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
-from demandops.views import causes as cause_list
-from demandops.views.kinds import KINDS, rows_of
-from demandops.views.rows import Filter, Row, exactly, page_of, sorted_rows
-from demandops.views.source import WORDS, Source
+from demandops.views.rows import exactly
 from demandops.views.vocabulary import decision_text
-from demandops.web import fleet_map, overview, time_line
-from demandops.web.follower import MOST_COMMITS, Follower
-from demandops.web.lists import LISTS, PAGE, Part, cells_of
-from demandops.web.thing import thing
-from demandops.web.time_line import Event
-
-# ---- the views, by address ----
-
-# The parameters that a link to another view keeps: the chosen commit or time, and the filter.
-_KEPT = ("at", "q")
-
-NAVIGATION = (
-    ("", "Overview"),
-    ("map", "Map"),
-    *((name, KINDS[name].title) for name in LISTS),
-    ("timeline", "Time line"),
-)
-
-
-_MOST_CAUSES = 100
-_NEWEST = 8  # changes
-
-Data = dict[str, Any]
-View = Callable[["ViewRequest"], tuple[str, Data]]
-
-
-class ViewRequest:
-    def __init__(self, follower: Follower, request: Request) -> None:
-        self.follower = follower
-        self.path = request.url.path.strip("/")
-        self.params = dict(request.query_params)
-        self.source: Source = follower.at(self.get("at"))
-        self.filter = Filter(self.get("q"))
-
-    def get(self, name: str) -> str:
-        # an address may have any length
-        return self.params.get(name, "").strip()[:500]
-
-    def page(self) -> int:
-        # `isdigit` accepts "²", of which `int` makes no number
-        text = self.get("page")
-        return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
-
-    def to(self, path: str | None = None, **changes: str | int) -> str:
-        # The address of a view, with the chosen commit or time and the filter. Without ``path``, it
-        # is this view with all its parameters. An empty value removes one.
-        kept = {name: value for name, value in self.params.items() if path is None or name in _KEPT}
-        params = {name: value for name, value in {**kept, **changes}.items() if value != ""}
-        query = f"?{urlencode(params)}" if params else ""
-        return f"/{self.path if path is None else path}{query}"
-
-    def events(self) -> list[Event]:
-        every = time_line.events(self.follower.history, self.follower.health_changes)
-        return [event for event in every if not self.filter or self.filter.matches(event.row())]
-
-    def link(self, part: Part) -> str:
-        # with its own filter instead of the current one
-        return self.to(part.view, **{"q": "", **part.params})
-
-
-def _overview(asked: ViewRequest) -> tuple[str, Data]:
-    source, wanted = asked.source, asked.filter
-    causes = [cause for cause in cause_list.causes(source) if wanted.matches(Row(cause.labels))]
-    moment = source.now if source.is_newest else source.entry.time
-    events = [event for event in asked.events() if event.time <= moment]
-    return "overview.html.j2", {
-        "figures": overview.figures(source, wanted, events, moment),
-        "causes": [(cause, overview.link_of(cause)) for cause in causes[:_MOST_CAUSES]],
-        "total": len(causes),
-        "applications": overview.applications(source, causes, wanted),
-        "tones": {**WORDS, **cause_list.KINDS},
-        "events": islice(overview.newest(events), _NEWEST),
-        "overrides": source.overrides,
-    }
-
-
-def _list(asked: ViewRequest) -> tuple[str, Data]:
-    kind, now, sort = KINDS[asked.path], asked.source.now, asked.get("sort")
-    rows = rows_of(asked.source, asked.path)
-    matching = [row for row in rows if asked.filter.matches(row)]
-    columns = {column.key: column for column in kind.columns if not column.only_wide}
-    if (key := sort.removeprefix("-")) in columns:  # `-` before a key is the reverse order
-        matching = sorted_rows(matching, columns[key], now, down=sort.startswith("-"))
-    shown, page, pages = page_of(matching, asked.page(), PAGE)
-    cells = [cells_of(kind, row, now) for row in shown]
-    # of the columns that only some rows fill, those that a shown row fills
-    used = {cell.column.key for each in cells for cell in each if cell.parts}
-    return "list.html.j2", {
-        "kind": kind,
-        "columns": [c for key, c in columns.items() if key in used or not shown],
-        "rows": cells,
-        "total": len(rows),
-        "matching": len(matching),
-        "sort": sort,
-        "page": page,
-        "pages": pages,
-    }
-
-
-def _timeline(asked: ViewRequest) -> tuple[str, Data]:
-    now, lane = asked.source, asked.get("lane")
-    lanes = {lane} if lane in time_line.LANES else time_line.LANES
-    events = [event for event in asked.events() if event.lane in lanes]
-    span, events = time_line.within(events, asked.get("span"), now.now)
-    chosen = None if now.is_newest else (now.entry.time, now.commit)
-    changed: list[str] = []
-    if asked.get("at"):
-        changed = asked.follower.reader().files_changed_by(now.commit)
-    shown, page, pages = page_of(events, asked.page(), size=50)
-    return "timeline.html.j2", {
-        "strip": time_line.strip(events, now.now, span, chosen),
-        "span": span,
-        "lanes": time_line.LANES,
-        "lane": lane,
-        "spans": time_line.SPANS,
-        "events": shown,
-        "total": len(events),
-        "page": page,
-        "pages": pages,
-        "changed": changed,
-        "is_cut": len(asked.follower.history) >= MOST_COMMITS,
-    }
-
-
-def _thing(asked: ViewRequest) -> tuple[str, Data]:
-    # `/demand?id=` and `/release?name=` are in people's bookmarks
-    kind = asked.get("kind") if asked.path == "thing" else asked.path
-    name = asked.get("id") or asked.get("name")
-    health = asked.follower.health_changes if asked.source.is_newest else ()
-    return "thing.html.j2", thing(asked.source, name, kind, health)
-
-
-VIEWS: Mapping[str, View] = {
-    "/": _overview,
-    "/map": lambda asked: (
-        "map.html.j2",
-        {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
-    ),
-    **{f"/{name}": _list for name in (*LISTS, "services")},
-    "/thing": _thing,
-    "/demand": _thing,
-    "/release": _thing,
-    "/timeline": _timeline,
-}
-
+from demandops.web.follower import Follower
+from demandops.web.page_views import NAVIGATION, VIEWS, View, ViewRequest
 
 # ---- the site ----
 #
@@ -371,27 +223,22 @@ class _Closed:
                 MutableHeaders(scope=message).update(_DOCS_HEADERS if is_of_docs else _HEADERS)
             await send(message)
 
-        is_foreign = scope["type"] == "http" and _is_foreign(Headers(scope=scope))
-        answer = _REFUSAL if is_foreign else self._application
-        await answer(scope, receive, sending)
-
-
-_REFUSAL = PlainTextResponse("another site asked for this; open the page itself\n", 403)
-
-
-def _is_foreign(headers: Headers) -> bool:
-    site = headers.get("sec-fetch-site")
-    if site is None:  # an old browser, a program, or another machine's page without TLS
-        origin = headers.get("origin")
-        return origin is not None and origin.partition("://")[2] != headers.get("host")
-    # A link to the page may be on any site: the browser shows the page in a tab of its own, where
-    # no other site can read it. `sec-purpose` says that nobody has followed the link yet.
-    is_link = (
-        headers.get("sec-fetch-mode") == "navigate"
-        and headers.get("sec-fetch-dest") == "document"
-        and "sec-purpose" not in headers
-    )
-    return site not in ("same-origin", "none") and not is_link
+        headers = Headers(scope=scope)
+        site, origin = headers.get("sec-fetch-site"), headers.get("origin")
+        if site is None:  # an old browser, a program, or another machine's page without TLS
+            is_foreign = origin is not None and origin.partition("://")[2] != headers.get("host")
+        else:
+            # A link to the page may be on any site: the browser shows the page in a tab of its own,
+            # where no other site can read it. `sec-purpose` says that nobody has followed the link
+            # yet.
+            is_link = (
+                headers.get("sec-fetch-mode") == "navigate"
+                and headers.get("sec-fetch-dest") == "document"
+                and "sec-purpose" not in headers
+            )
+            is_foreign = site not in ("same-origin", "none") and not is_link
+        refusal = PlainTextResponse("another site asked for this; open the page itself\n", 403)
+        await (refusal if is_foreign else self._application)(scope, receive, sending)
 
 
 # ---- the web server ----

@@ -53,16 +53,8 @@ class Event:
     tone: str = ""
 
     def row(self) -> Row:
-        return Row(
-            {
-                "lane": [self.lane],
-                "word": [self.word],
-                "summary": [self.summary],
-                "who": [self.who],
-                "commit": [self.commit],
-                "release": [self.release],
-            }
-        )
+        names = ("lane", "word", "summary", "who", "commit", "release")
+        return Row({name: [getattr(self, name)] for name in names})
 
 
 # The operations of commits that book demands, and of those that end them.
@@ -72,7 +64,17 @@ _BY_DEMANDS = BOOKED | RELEASED | {"renew", "rollback"}
 
 
 def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Event]:
-    all_events = [of_commit(commit) for commit in commits]
+    all_events = []
+    for commit in commits:
+        entry = commit.entry
+        word = entry.first("Operation") or "by hand"  # only generators write this trailer
+        lane = "people"
+        if word in _BY_DEMANDS or PROPOSAL in entry.trailers:
+            lane = "demands"
+        elif word == "expire-override" or (word == "by hand" and OVERRIDES_ROOT in commit.roots):
+            lane = "overrides"
+        who = ", ".join(entry.trailers.get("Requester", ())) or entry.author
+        all_events.append(Event(lane, entry.time, word, entry.summary, who, entry.commit))
     for change in health:
         reason = f": {change.reason}" if change.reason else ""
         summary = f"was {change.before}, is {change.after}{reason}"
@@ -81,18 +83,6 @@ def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Ev
             Event("health", change.time, change.after, summary, "", "", change.release, tone)
         )
     return sorted(all_events, key=lambda event: event.time, reverse=True)
-
-
-def of_commit(commit: Commit) -> Event:
-    entry = commit.entry
-    word = entry.first("Operation") or "by hand"  # only generators write this trailer
-    lane = "people"
-    if word in _BY_DEMANDS or PROPOSAL in entry.trailers:
-        lane = "demands"
-    elif word == "expire-override" or (word == "by hand" and OVERRIDES_ROOT in commit.roots):
-        lane = "overrides"
-    who = ", ".join(entry.trailers.get("Requester", ())) or entry.author
-    return Event(lane, entry.time, word, entry.summary, who, entry.commit)
 
 
 def within(events: Sequence[Event], span: str, now: datetime) -> tuple[str, list[Event]]:

@@ -17,7 +17,7 @@ from demandops.views.causes import causes as causes_of
 from demandops.views.rows import Filter, Row
 from demandops.views.source import Source
 from demandops.web.follower import Follower
-from demandops.web.lists import LISTS
+from demandops.web.page_views import LISTS
 from demandops.web.server import Site
 from starlette.testclient import TestClient
 

@@ -17,9 +17,9 @@ from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.views.kinds import rows_of
 from demandops.views.rows import Filter
-from demandops.web import fleet_map, server
+from demandops.web import fleet_map, page_views
 from demandops.web.follower import Follower
-from demandops.web.lists import LISTS
+from demandops.web.page_views import LISTS
 from demandops.web.server import Site
 from starlette.testclient import TestClient
 
@@ -101,7 +101,7 @@ def test_too_many_causes_are_counted(
     person.change({"registry/images.yaml": "images: [\n", "registry/charts.yaml": "charts: [\n"})
     broken(booked)
     assert "more causes" not in look("/").text
-    monkeypatch.setattr(server, "_MOST_CAUSES", 1)
+    monkeypatch.setattr(page_views, "_MOST_CAUSES", 1)
     page = look("/")
     assert len(page.texts("h3")) == 1 and "and 1 more causes; filter to see them" in page.text
     assert page.texts("h1") == ["2 things need attention"]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from demandops.cluster.health import Health
-from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
+from demandops.cluster.rollouts import OldBootstrap, Orphan, ReleaseStatus
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
@@ -20,7 +20,7 @@ from demandops.views.rows import Filter, page_of
 from demandops.views.source import Source
 from demandops.web import fleet_map, time_line
 from demandops.web.follower import Follower
-from demandops.web.thing import thing
+from demandops.web.page_views import thing
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes

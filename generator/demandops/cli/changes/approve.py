@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import sys
 
 import click
 
 from demandops.base.errors import InvalidInput, suggestion
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
-from demandops.cli.changes import person_change
-from demandops.cli.changes.person_change import warned_if_unnamed
-from demandops.cli.json_output import output_option, show
+from demandops.cli.changes.person_change import (
+    Options,
+    changing,
+    confirm,
+    warned_if_unnamed,
+    writable,
+)
+from demandops.cli.json_output import show
 from demandops.cli.output import done, errors
 from demandops.cli.queries.diff import differences, entry_lines, release_lines
-from demandops.cli.target import names_of, signing_option, with_options, writable_repo_option
+from demandops.cli.target import names_of
 from demandops.repo.git.repository import PushDenied
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
@@ -29,10 +34,8 @@ from demandops.repo.write.proposal_branch import (
 
 # ---- ``demandops approve``: merge a proposal in the caller's own name ----
 
-# what both commands take
-_answering = with_options(
-    click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals")),
-    person_change.reason_option,
+_named = click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals"))
+_answering = changing(
     click.option(
         "--commit",
         metavar="ID",
@@ -40,10 +43,7 @@ _answering = with_options(
         help="The whole id of the commit that you looked at. If the branch is at another commit, "
         "nothing is changed.",
     ),
-    person_change.yes_option,
-    writable_repo_option,
-    signing_option,
-    output_option,
+    dry_run=False,
 )
 
 
@@ -79,16 +79,9 @@ def _proposal(repo: Reader, name: str, commit: str, output: str) -> PendingPropo
 
 
 @click.command()
+@_named
 @_answering
-def approve(
-    name: str,
-    reason: str,
-    commit: str,
-    yes: bool,
-    state_repo: str,
-    signing_key: Path | None,
-    output: str,
-) -> None:
+def approve(name: str, commit: str, options: Options) -> None:
     """Approve a proposal: merge its branch in your own name.
 
     At a terminal, the command first shows what the merge would change, and asks. Elsewhere, and
@@ -103,13 +96,13 @@ def approve(
       demandops approve visit -m "Agreed with the control room"
       demandops approve visit --commit 5d41402abc4b2a76b9719d911017c592e81f9d3a
     """
-    if not (commit or person_change.is_asked(yes)):
+    if not commit and (options.yes or not sys.stdin.isatty()):
         raise click.UsageError(
             "name the commit that you looked at: --commit ID; `demandops get proposals` lists it"
         )
-    with person_change.writable(state_repo, signing_key) as repo:
-        proposal = _proposal(repo, name, commit, output)
-        if output == "text":
+    with writable(options) as repo:
+        proposal = _proposal(repo, name, commit, options.output)
+        if options.output == "text":
             base = repo.base_of(proposal.commit)
             entries, preview = differences(repo, base, proposal.commit)
             # anybody can commit under the generator's name, so what is more than demands is shown
@@ -120,31 +113,25 @@ def approve(
                 *(f"~ file {path}" for path in by_hand),
             ):
                 errors.print(f"  {one_line(line)}")
-        person_change.confirm("Approve it?", yes or bool(commit))
+        confirm("Approve it?", options.yes or bool(commit))
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
-        details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
+        person = warned_if_unnamed(repo.operator())
+        details = CommitDetails(person, REAL.now(), summary, options.reason)
         merged = person_commit.merge(repo.repository, proposal, details)
         done.append(f"{proposal.branch} is merged in {merged.commit}")
         if proposal.branch.startswith(OF_PEOPLE):  # a generator removes only its own branches
             _remove(repo, proposal)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": merged.commit}
-    show(output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"])
+    show(options.output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"])
 
 
 # ---- ``demandops reject``: refuse a proposal ----
 
 
 @click.command()
+@_named
 @_answering
-def reject(
-    name: str,
-    reason: str,
-    commit: str,
-    yes: bool,
-    state_repo: str,
-    signing_key: Path | None,
-    output: str,
-) -> None:
+def reject(name: str, commit: str, options: Options) -> None:
     """Reject a proposal: delete its branch, and record who and why.
 
     The requester gets the reason; the generator aborts the goal with `turned-down`. If the branch
@@ -155,11 +142,12 @@ def reject(
       demandops reject visit -m "The road is closed"
       demandops reject demand/visit-3f2a9c1b04de --yes
     """
-    with person_change.writable(state_repo, signing_key) as repo:
-        proposal = _proposal(repo, name, commit, output)
-        person_change.confirm("Reject it?", yes or bool(commit))
+    with writable(options) as repo:
+        proposal = _proposal(repo, name, commit, options.output)
+        confirm("Reject it?", options.yes or bool(commit))
         summary = f"Reject {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
-        details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
+        person = warned_if_unnamed(repo.operator())
+        details = CommitDetails(person, REAL.now(), summary, options.reason)
         recorded = None
         try:
             recorded = person_commit.reject(repo.repository, proposal, details).commit
@@ -169,7 +157,7 @@ def reject(
         _remove(repo, proposal)
     data = {"outcome": "rejected", "branch": proposal.branch, "commit": recorded}
     where = f"recorded in {recorded}, " if recorded else ""
-    show(output, data, [f"rejected: {where}{proposal.branch} is deleted"])
+    show(options.output, data, [f"rejected: {where}{proposal.branch} is deleted"])
 
 
 def _remove(repo: Reader, proposal: PendingProposal) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +38,9 @@ from demandops.decide.decision import decide
 from demandops.model.config.base_model import duration_text
 from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
-from demandops.serve.approvals.proposal import parse_waiting_text
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Receipt
+from demandops.serve.proposal import parse_waiting_text
 from demandops.views.vocabulary import Json
 
 
@@ -56,55 +56,6 @@ class Document:
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
-
-    def as_operation(self, operation: str) -> Document:  # release or renew
-        goal = self.goal
-        if not isinstance(goal, dict):  # the check of goals refuses it later
-            return self
-        if not is_demand_goal(goal):
-            return replace(self, goal={**goal, "shutdown": operation == "release"})
-        names = ("apiVersion", "kind", "demand", "request", "requesters")
-        given = {name: goal[name] for name in names if name in goal}
-        return replace(self, goal=given | {"operation": operation})
-
-
-class _Answer(Future["Receipt | dict[str, str]"]):
-    # the receipt, or the proposal that awaits approval
-
-    def of(self, generator: Generator, document: Document, wait: bool) -> _Answer:
-        def listen(stage: str, text: str) -> None:
-            if stage != "proposed":
-                return
-            if wait:
-                errors.print(f"{document.file}: request '{document.request_id}' {text}")
-            elif not self.done():
-                self.set_result(parse_waiting_text(text))
-
-        def finish(future: Future[Receipt]) -> None:
-            if self.done():  # the proposal was the answer
-                return
-            if (error := future.exception()) is not None:
-                self.set_exception(error)
-            else:
-                self.set_result(future.result())
-
-        generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
-        return self
-
-    def row(self, index: int, document: Document) -> Json:
-        try:
-            result = self.result(timeout=0)
-        except (ShuttingDown, TimeoutError):  # the command was interrupted
-            return _row(index, document.request_id, "waiting")
-        except Unsound:  # it is not known whether the request was booked
-            raise
-        except DemandOpsError as error:
-            return _refused(index, document, error)
-        if not isinstance(result, Receipt):
-            return _row(index, document.request_id, "proposed", proposal=result)
-        names = ("commit", "warnings", "not_held", "placed")
-        more = {name: getattr(result, name) for name in names}
-        return _row(index, result.request_id, result.outcome, **more)
 
 
 @click.command()
@@ -186,11 +137,17 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     documents = []
     for file in files:
         name, text = read_input(file)
-        goals = enumerate(strict_yaml.load_all(text, name))
-        documents += [Document(name, goal, text, at) for at, goal in goals if goal is not None]
-    if release or renew:
-        operation = "release" if release else "renew"
-        documents = [document.as_operation(operation) for document in documents]
+        for number, goal in enumerate(strict_yaml.load_all(text, name)):
+            # what is no mapping is refused later, by the check of goals
+            if (release or renew) and isinstance(goal, dict):
+                if is_demand_goal(goal):
+                    kept = ("apiVersion", "kind", "demand", "request", "requesters")
+                    goal = {key: goal[key] for key in kept if key in goal}  # noqa: PLW2901
+                    goal["operation"] = "release" if release else "renew"
+                else:
+                    goal["shutdown"] = release
+            if goal is not None:
+                documents.append(Document(name, goal, text, number))
     if not documents:
         raise InvalidInput([fault("", f"no demand in {', '.join(files)}; write one")])
     is_unread = any(form_faults(document.goal) for document in documents)
@@ -198,7 +155,15 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
         rows = _send(documents, hold, action, timeout, output)
     else:
         if is_unread:
-            rows = [_unbooked(index, document) for index, document in enumerate(documents)]
+            message = "not booked, because another request of the same command cannot be parsed"
+            rows = [
+                _refused(
+                    index,
+                    document,
+                    InvalidInput(form_faults(document.goal) or [fault("", message)]),
+                )
+                for index, document in enumerate(documents)
+            ]
         elif dry_run:
             rows = _dry_run(documents, state_repo, output)
         else:
@@ -228,7 +193,12 @@ def _send(
     ros = imported("demand", "demandops_ros.demand_command")
     goals = [document.goal for document in documents]
     rows = []
-    with ros.sent(goals, hold, action, timeout, lambda text: _tell(text, output)) as answers:
+
+    def tell(text: str) -> None:
+        if output == "text":
+            errors.print(text)
+
+    with ros.sent(goals, hold, action, timeout, tell) as answers:
         for index, (document, answer) in enumerate(zip(documents, answers, strict=True)):
             if isinstance(answer, DemandOpsError):
                 rows.append(_refused(index, document, answer))
@@ -240,18 +210,6 @@ def _send(
                 done.append(f"{answer['outcome']} in {answer['commit']}")
         _show_rows(rows, documents, output, dry_run=False)
     return rows
-
-
-def _tell(text: str, output: str) -> None:
-    if output == "text":
-        errors.print(text)
-
-
-def _show_rows(rows: list[Json], documents: list[Document], output: str, dry_run: bool) -> None:
-    if output == "json":
-        print_json(rows)
-    else:
-        _print_rows(rows, documents, dry_run)
 
 
 def _is_unanswered(row: Json) -> bool:
@@ -272,12 +230,6 @@ def _row(index: int, request_id: str, outcome: str, **more: Any) -> Json:  # noq
     } | more
 
 
-def _unbooked(index: int, document: Document) -> Json:
-    message = "not booked, because another request of the same command cannot be parsed"
-    faults = form_faults(document.goal) or [fault("", message)]
-    return _refused(index, document, InvalidInput(faults))
-
-
 def _refused(index: int, document: Document, error: DemandOpsError) -> Json:
     lines = strict_yaml.lines(document.text, document.number)
     faults = [
@@ -290,27 +242,65 @@ def _refused(index: int, document: Document, error: DemandOpsError) -> Json:
 def _book(
     documents: list[Document], state_repo: str, wait: bool, signing_key: Path | None
 ) -> list[Json]:
-    answers: list[_Answer] = []
+    # of each document, the receipt, or the proposal that awaits approval
+    answers: list[Future[Receipt | dict[str, str]]] = []
+
+    def submit(generator: Generator, document: Document) -> None:
+        answer = Future[Receipt | dict[str, str]]()
+
+        def listen(stage: str, text: str) -> None:
+            if stage == "proposed" and wait:
+                errors.print(f"{document.file}: request '{document.request_id}' {text}")
+            elif stage == "proposed" and not answer.done():
+                answer.set_result(parse_waiting_text(text))
+
+        def finish(future: Future[Receipt]) -> None:
+            if answer.done():  # the proposal was the answer
+                return
+            if (error := future.exception()) is not None:
+                answer.set_exception(error)
+            else:
+                answer.set_result(future.result())
+
+        generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
+        answers.append(answer)
+
     has_started = False
     try:
         with started_generator(state_repo, signing_key) as generator, progress("booking") as report:
             has_started = True
             for document in documents:
-                answers.append(_Answer().of(generator, document, wait))
+                submit(generator, document)
             for number, answer in enumerate(answers, start=1):
                 ledger_change.await_answer(answer)
                 report(number, len(documents))
     except KeyboardInterrupt:
         if not has_started:
             raise
-    if len(answers) < len(documents):
-        answers.append(_Answer())  # it may be in the journal already
-    for _ in documents[len(answers) :]:
-        unsent = _Answer()
-        unsent.set_exception(Withdrawn("was not sent, because of the interrupt; send it again"))
-        answers.append(unsent)
-    pairs = enumerate(zip(documents, answers, strict=True))
-    rows = [answer.row(index, document) for index, (document, answer) in pairs]
+    rows = []
+    for index, document in enumerate(documents):
+        if index > len(answers):
+            unsent = Withdrawn("was not sent, because of the interrupt; send it again")
+            rows.append(_refused(index, document, unsent))
+            continue
+        try:
+            # the next one after those that were submitted may be in the journal already
+            result = answers[index].result(timeout=0) if index < len(answers) else None
+        except (ShuttingDown, TimeoutError):  # the command was interrupted
+            result = None
+        except Unsound:  # it is not known whether the request was booked
+            raise
+        except DemandOpsError as error:
+            rows.append(_refused(index, document, error))
+            continue
+        if result is None:
+            rows.append(_row(index, document.request_id, "waiting"))
+        elif not isinstance(result, Receipt):
+            rows.append(_row(index, document.request_id, "proposed", proposal=result))
+        else:
+            names = ("commit", "warnings", "not_held", "placed")
+            more = {name: getattr(result, name) for name in names}
+            rows.append(_row(index, result.request_id, result.outcome, **more))
     done.extend(
         f"request '{one_line(row['request'])}' {row['outcome']} in {row['commit']}"
         for row in rows
@@ -360,9 +350,12 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
     return rows
 
 
-def _print_rows(  # noqa: PLR0912 - a part of a row each
-    rows: list[Json], documents: list[Document], dry_run: bool
+def _show_rows(  # noqa: PLR0912 - a part of a row each
+    rows: list[Json], documents: list[Document], output: str, dry_run: bool
 ) -> None:
+    if output == "json":
+        print_json(rows)
+        return
     out = console()
     for row, document in zip(rows, documents, strict=True):
         title = f"{document.file}: request {row['index']} '{one_line(row['request'])}'"

@@ -26,7 +26,7 @@ from demandops.views.vocabulary import Json
 
 
 def _set_drained(node: str, drained: bool, options: Options) -> None:
-    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+    with writable(options) as repo:
         config = repo.snapshot().state.config
         if node not in config.nodes:
             message = f"there is no node '{node}'{suggestion(node, config.nodes)}"
@@ -108,7 +108,7 @@ def revert(commit: str, options: Options) -> None:
       demandops revert 5d41402a --dry-run
       demandops revert main -m "It was the wrong node"
     """
-    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+    with writable(options) as repo:
         id = repo.commit(commit)
         entry = next(repo.log(id))
         demands = entry.trailers.get("Demand-Id", ())

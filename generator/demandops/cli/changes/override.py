@@ -193,7 +193,7 @@ def _create(
     fields: Mapping[str, Any],
     options: Options,
 ) -> None:
-    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+    with writable(options) as repo:
         options.require_reason()
         if not (chosen := selector(selected)):
             raise click.UsageError("select what the override applies to, for example --node edge")
@@ -239,7 +239,7 @@ def override_text(name: str, fields: dict[str, Any], note: str = "") -> str:
 def _end(
     name: str, summary: str, selected: Mapping[str, tuple[str, ...]], options: Options
 ) -> None:
-    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+    with writable(options) as repo:
         overrides = repo.snapshot().state.config.overrides
         override = overrides.get(name)
         if override is None and repo.file_reader()(_path_of(name)) is not None:

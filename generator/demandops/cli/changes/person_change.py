@@ -43,22 +43,12 @@ from demandops.repo.history.commit_log import Person
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails
-from demandops.serve.approvals.proposal import merge_request
+from demandops.serve.proposal import merge_request
 from demandops.views import vocabulary
 from demandops.views.vocabulary import Json
 
 # ---- the options of all these commands ----
 
-reason_option = click.option(
-    "-m",
-    "--reason",
-    metavar="TEXT",
-    callback=lambda ctx, param, text: " ".join((text or "").split()),
-    help="The reason. It is written to the commit message and to the file of a new override.",
-)
-yes_option = click.option(
-    "-y", "--yes", is_flag=True, help="Do not ask. Needed where there is no terminal."
-)
 propose_option = click.option(
     "--propose",
     is_flag=True,
@@ -72,9 +62,9 @@ class Options:
     state_repo: str
     signing_key: Path | None
     reason: str
-    dry_run: bool
     yes: bool
     output: str
+    dry_run: bool = False
     propose: bool = False
 
     def require_reason(self) -> None:
@@ -83,7 +73,7 @@ class Options:
 
 
 def changing(
-    *more: Callable[[target.Command], target.Command],
+    *more: Callable[[target.Command], target.Command], dry_run: bool = True
 ) -> Callable[[target.Command], target.Command]:
     # the command gets the values of these options as `options`
     def add(command: target.Command) -> target.Command:
@@ -93,10 +83,19 @@ def changing(
             return command(options=Options(**{name: given.pop(name) for name in names}), **given)
 
         return target.with_options(
-            reason_option,
+            click.option(
+                "-m",
+                "--reason",
+                metavar="TEXT",
+                callback=lambda ctx, param, text: " ".join((text or "").split()),
+                help="The reason. It is written to the commit message and to the file of a new "
+                "override.",
+            ),
             *more,
-            target.dry_run_option,
-            yes_option,
+            *([target.dry_run_option] if dry_run else []),
+            click.option(
+                "-y", "--yes", is_flag=True, help="Do not ask. Needed where there is no terminal."
+            ),
             target.writable_repo_option,
             target.signing_option,
             json_output.output_option,
@@ -108,10 +107,6 @@ def changing(
 # ---- what follows, and the question ----
 
 _MOST_SHOWN = 30
-
-
-def is_asked(yes: bool) -> bool:
-    return not yes and sys.stdin.isatty()
 
 
 def confirm(question: str, yes: bool) -> None:
@@ -160,19 +155,11 @@ def warned_if_unnamed(person: Person) -> Person:
 # ---- a commit of a person ----
 
 
-def _text(release: Release | None, state: State) -> object:
-    with suppress(InvalidInput):
-        return release and gitops.render(release, state.config, state.evaluate)
-    return None
-
-
 @contextmanager
-def writable(
-    state_repo: str, signing_key: Path | None, *, dry_run: bool = False
-) -> Iterator[Reader]:
+def writable(options: Options) -> Iterator[Reader]:
     # a dry run writes nothing, so the state repo may also be a checkout
-    with reader.opened(state_repo, only_read=dry_run) as repo:
-        repo.repository.signer = Signer(signing_key) if signing_key else None
+    with reader.opened(options.state_repo, only_read=options.dry_run) as repo:
+        repo.repository.signer = Signer(options.signing_key) if options.signing_key else None
         yield repo
 
 
@@ -191,6 +178,12 @@ def commit(
     with progress("reading the ledger") as report:
         before = repo.snapshot(progress=report)
         after = person_commit.state_after(repo.repository, before, files)
+
+    def text(release: Release | None, state: State) -> object:
+        with suppress(InvalidInput):
+            return release and gitops.render(release, state.config, state.evaluate)
+        return None
+
     old, new = planned_releases(before.state), planned_releases(after)
     changes = []
     for key in {**old, **new}:
@@ -198,7 +191,7 @@ def commit(
         change = describe_change(was, now, key in old)
         # a release also has what no file shows, such as whether its node is drained
         if change.change != "change" or (
-            was != now and (change.details or _text(was, before.state) != _text(now, after))
+            was != now and (change.details or text(was, before.state) != text(now, after))
         ):
             changes.append(change)
     changes.sort(key=lambda change: (change.change, change.name))
@@ -235,7 +228,7 @@ def commit(
     details = CommitDetails(person, REAL.now(), summary, reason)
     if not options.propose:
         published = person_commit.commit_to_main(repo.repository, files, details)
-        text = [
+        told = [
             f"{summary}: commit {published.commit} on {MAIN_BRANCH}",
             "a running generator carries out this commit, or else the next generator that starts",
             *target.hint_to_pull(),
@@ -252,11 +245,11 @@ def commit(
                 data["link"] = forge.open(branch, MAIN_BRANCH, title, reason).link
         except ForgeError as error:  # the branch is there, so a person can open the merge request
             errors.print(f"warning: no merge request was opened: {error}; open one for {branch}")
-        text = [f"{summary}: merge {branch} {data['link'] or ''}".rstrip()]
+        told = [f"{summary}: merge {branch} {data['link'] or ''}".rstrip()]
     done.append(f"commit {published.commit} on {published.branch}")
     data |= {
         "outcome": "proposed" if options.propose else "committed",
         "commit": published.commit,
         "branch": published.branch,
     }
-    json_output.show(options.output, data, text)
+    json_output.show(options.output, data, told)

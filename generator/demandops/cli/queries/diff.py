@@ -1,23 +1,88 @@
-"""``demandops diff``: the differences between two commits, in bookkeeping and releases."""
+"""``demandops bookkeeping``: who requests what; ``diff``: that of two commits, and releases."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import click
 
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import output_option, show
-from demandops.cli.output import SIGNS, errors, progress, warn_of_problems
+from demandops.cli.json_output import output_formats, output_option, show
+from demandops.cli.output import SIGNS, at_option, errors, progress, warn_of_problems
+from demandops.cli.table import Table, list_table, table_of
 from demandops.cli.target import state_repo_option
-from demandops.decide.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
+from demandops.decide.bookkeeping import EntryChange, as_data, bookkeeping_changes
+from demandops.decide.bookkeeping import bookkeeping as derive
 from demandops.decide.changeset import MergePreview, ReleaseChange, planned_releases, preview
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
-from demandops.repo.history import revisions
+from demandops.repo.history import commit_log
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
+from demandops.views.kinds import KINDS, rows_of
+from demandops.views.rows import Column
+from demandops.views.source import Source
+from demandops.views.vocabulary import time_text
+
+# ---- ``demandops bookkeeping`` ----
+
+
+@click.command()
+@state_repo_option
+@at_option
+@output_formats("text", "wide", "json")
+def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
+    """Show who requests which service and connection.
+
+    \b
+    Examples:
+      demandops bookkeeping
+      demandops bookkeeping --at 14:03 -o json
+    """
+    with reader.opened(state_repo) as repo:
+        source = Source.read(repo, loaded(repo, at))
+    data = as_data(derive(source.state), source.commit)
+    capacity = [
+        {"node": node, "name": name, **amounts}
+        for node, resources in data.get("nodes", {}).items()
+        for name, amounts in resources.items()
+    ]
+    text: list[str | Table] = []
+    for name in ("services", "connections"):
+        table = list_table(KINDS[name], rows_of(source, name), source.now, wide=True)
+        text += [replace(table, title=name.title(), empty="(nothing)", whole=output == "wide"), ""]
+    for title, columns, items in (
+        ("Suspended", _SUSPENDED, data.get("suspended")),
+        ("Capacity", _CAPACITY, capacity),
+        ("Waiting for room", _WAITING, data.get("waiting")),
+    ):
+        if items:
+            text += [table_of(columns, items, source.now, title=title), ""]
+    show(output, data, [*text, f"at {source.commit}"])
+
+
+_SUSPENDED = (
+    Column("id", "Subject", texts_of=lambda claim, now: "{kind} {id}".format(**claim)),
+    Column("demand", "Demand", 2),
+    Column("requesters", "Requesters", 1),
+    Column("override", "By", 3),
+    Column("reason", "Reason", 4),
+)
+_CAPACITY = (
+    Column("node", "Node"),
+    Column("name", "Resource"),
+    Column("requested", "Requested"),
+    Column("capacity", "Capacity"),
+)
+_WAITING = (
+    Column("demand", "Demand"),
+    Column("requesters", "Requesters", 2),
+    Column("since", "Since", 1, texts_of=lambda demand, now: time_text(demand["since"])),
+    Column("priority", "Priority", 1),
+)
+
+# ---- ``demandops diff`` ----
 
 
 @click.command()
@@ -63,7 +128,7 @@ def differences(
     for read in map(repo.file_reader, commits):
         read_texts = {path: read(path) for path in differing}
         texts.append({path: text for path, text in read_texts.items() if text is not None})
-    entries = bookkeeping_changes(bookkeeping(old.state), bookkeeping(new.state))
+    entries = bookkeeping_changes(derive(old.state), derive(new.state))
     planned = planned_releases(old.state), planned_releases(new.state)
     return entries, preview(*planned, *texts)
 
@@ -71,7 +136,7 @@ def differences(
 def resolved(repo: Reader, revision: str | None) -> str:
     """Return the id of a commit; if a time names it, say which commit that is."""
     commit, text = repo.commit(revision), revision or ""
-    time = revisions.parse_time(text, REAL.now(), end=True)
+    time = commit_log.parse_time(text, REAL.now(), end=True)
     if time is not None and not commit.startswith(text.lower()):
         entry = next(repo.log(commit))
         errors.print(

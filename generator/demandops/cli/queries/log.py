@@ -18,7 +18,7 @@ from demandops.cli.queries.diff import resolved
 from demandops.cli.table import Table, list_table
 from demandops.cli.target import name_options, state_repo_option
 from demandops.repo import reader
-from demandops.repo.history import revisions
+from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.reader import Reader
 from demandops.views.kinds import KINDS, event
@@ -41,9 +41,9 @@ _TRAILERS = {
 def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
     if text is None:
         return None
-    time = revisions.parse_time(text, REAL.now(), end=param.name == "until")
+    time = commit_log.parse_time(text, REAL.now(), end=param.name == "until")
     if time is None:
-        raise click.BadParameter(f"'{text}' is not a time; write it like {revisions.TIMES}")
+        raise click.BadParameter(f"'{text}' is not a time; write it like {commit_log.TIMES}")
     return time
 
 
@@ -75,7 +75,7 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
     "--since",
     callback=_time,
     metavar="TIME",
-    help=f"List only commits at or after this time: {revisions.TIMES}.",
+    help=f"List only commits at or after this time: {commit_log.TIMES}.",
 )
 @click.option(
     "--until", callback=_time, metavar="TIME", help="List only commits at or before this time."

@@ -408,7 +408,7 @@ Services: TypeAlias = "Mapping[str, Service]"
 Problem: TypeAlias = "tuple[str, str]"
 
 
-def resolved_services(
+def resolved_services(  # noqa: PLR0912 - a branch for each fault
     appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
 ) -> tuple[Services, list[Problem]]:
     """Return all services of an appdef and no problem, or no service and the problems."""
@@ -428,7 +428,35 @@ def resolved_services(
         if name in definitions:
             used = {**dict(definitions[name]), "inputs": bound}
             services[name] = Service.model_construct(**used, folder=name, shared=True)
-    problems = [*_input_problems(appdef, definitions, services)]
+    problems: list[Problem] = []
+    for name, bound in appdef.uses.items():
+        if name not in definitions:
+            problem = f"appdefs/{name}/service.yaml does not exist; add it"
+            problems.append((f"uses.{name}", problem + suggestion(name, definitions)))
+            continue
+        inputs = definitions[name].inputs
+        for role in sorted(inputs.keys() - bound.keys()):
+            problem = (
+                "is missing; say where the input comes from: an input of this definition, or "
+                "<service>.<output>"
+            )
+            problems.append((f"uses.{name}.{role}", problem))
+        for role in sorted(bound.keys() - inputs.keys()):
+            problem = f"'{name}' has no input '{role}'; leave it out{suggestion(role, inputs)}"
+            problems.append((f"uses.{name}.{role}", problem))
+    for service in services.values():
+        for role, origin in service.inputs.items():
+            name, _, output = origin.partition(".")
+            outputs = services[name].outputs if name in services else {}
+            if not output and origin not in appdef.inputs:
+                problem = f"'{origin}' is not an input{suggestion(origin, appdef.inputs)}"
+            elif output and name not in services:
+                problem = f"'{name}' is not a service{suggestion(name, services)}"
+            elif output and output not in outputs:
+                problem = f"'{name}' has no output '{output}'{suggestion(output, outputs)}"
+            else:
+                continue
+            problems.append((_place(service, role), problem))
     if problems:  # the others are found only after a person has mended these
         return {}, problems
     graph = {
@@ -444,41 +472,6 @@ def resolved_services(
     for name in order:
         problems += _set_roots(name, services)
     return ({}, problems) if problems else (services, [])
-
-
-def _input_problems(
-    appdef: ApplicationDefinition,
-    definitions: Mapping[str, ServiceDefinition],
-    services: Services,
-) -> Iterator[Problem]:
-    for name, bound in appdef.uses.items():
-        if name not in definitions:
-            hint = suggestion(name, definitions)
-            yield f"uses.{name}", f"appdefs/{name}/service.yaml does not exist; add it{hint}"
-            continue
-        inputs = definitions[name].inputs
-        for role in sorted(inputs.keys() - bound.keys()):
-            yield (
-                f"uses.{name}.{role}",
-                "is missing; say where the input comes from: an input of this definition, or "
-                "<service>.<output>",
-            )
-        for role in sorted(bound.keys() - inputs.keys()):
-            hint = suggestion(role, inputs)
-            yield f"uses.{name}.{role}", f"'{name}' has no input '{role}'; leave it out{hint}"
-    for service in services.values():
-        for role, origin in service.inputs.items():
-            name, _, output = origin.partition(".")
-            outputs = services[name].outputs if name in services else {}
-            if not output and origin not in appdef.inputs:
-                problem = f"'{origin}' is not an input{suggestion(origin, appdef.inputs)}"
-            elif output and name not in services:
-                problem = f"'{name}' is not a service{suggestion(name, services)}"
-            elif output and output not in outputs:
-                problem = f"'{name}' has no output '{output}'{suggestion(output, outputs)}"
-            else:
-                continue
-            yield _place(service, role), problem
 
 
 def _place(service: Service, role: str) -> str:

@@ -21,17 +21,11 @@ from demandops.templating import charts
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:
-    for check in (
-        _check_inventory,
-        _check_domains,
-        _check_host_network,
-        _check_charts,
-        _check_services,
-        _check_uses,
-        _check_versions,
-        _check_wire_types,
-    ):
-        check(config, reader)
+    _check_inventory(config, reader)
+    _check_domains(config, reader)
+    _check_charts(config, reader)
+    _check_services(config, reader)
+    _check_versions(config, reader)
     for connection_type in connection_types.by_number():
         reader.faults += connection_type.config_faults(config, reader)
     _check_overrides(config, reader)
@@ -68,6 +62,7 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
 def _check_domains(config: Config, reader: ConfigReader) -> None:
     argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
     seen: dict[str, str] = {}
+    closed = ""  # a domain that forbids the host's network
     for domain in config.domains.values():
         file, place = reader.places[configs.DOMAINS_FILE][domain.name]
         if domain.broker is not None:
@@ -88,24 +83,22 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
                 "all that Argo CD may; choose another namespace"
             )
             reader.add_fault(file, f"{place}.namespace", message)
-
-
-def _check_host_network(config: Config, reader: ConfigReader) -> None:
+        if domain.pod_security == "baseline":
+            closed = closed or domain.name
     for node in config.nodes.values():
-        domain = config.domain_of.get(node.id)
-        if domain and domain.pod_security == "baseline" and node.host_network:
+        owner = config.domain_of.get(node.id)
+        if owner and owner.pod_security == "baseline" and node.host_network:
             file, place = reader.places[configs.NODES_FILE][node.id]
             message = (
-                f"is true (the default), and podSecurity of access domain '{domain.name}' is "
+                f"is true (the default), and podSecurity of access domain '{owner.name}' is "
                 "baseline, which forbids it; set 'hostNetwork: false' or "
                 "'podSecurity: host-network'"
             )
             reader.add_fault(file, f"{place}.hostNetwork", message)
-    closed = [d.name for d in config.domains.values() if d.pod_security == "baseline"]
     for word, file in config.entry_files[configs.CLIENTS_FILE].items():
         if closed and config.clients.of(word).host_network:
             message = (
-                f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
+                f"is true, and podSecurity of access domain '{closed}' is baseline, which "
                 "forbids it; leave it out, so that each client has the setting of its node"
             )
             reader.add_fault(file, f"{word}.hostNetwork", message)
@@ -114,42 +107,39 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
 def _check_charts(config: Config, reader: ConfigReader) -> None:
     for name, chart in config.charts.items():
         file, place = reader.places[configs.CHARTS_FILE][name]
-        _check_chart(file, place, chart, config, reader)
-        for channel, source in chart.channels.items():
-            _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
+        sources: dict[str, ChartSource] = {place: chart}
+        sources |= {f"{place}.channels.{name}": source for name, source in chart.channels.items()}
+        for where, source in sources.items():
+            path = f"{source.folder}/Chart.yaml"
+            text = config.files.get(path)
+            if not source.folder:
+                continue
+            if text is None:
+                message = f"'{path}' does not exist; correct the folder"
+                if not path.startswith("appdefs/"):
+                    message = f"'{source.folder}' is not in appdefs/; move the chart there"
+                reader.add_fault(file, f"{where}.folder", message)
+                continue
+            try:
+                metadata = strict_yaml.load(text, path)
+            except InvalidInput as error:
+                reader.faults += error.faults
+                continue
+            version = metadata.get("version") if isinstance(metadata, dict) else None
+            if version != source.version:
+                message = f"is {source.version}, but {path} says {version}; make them equal"
+                if version is None:
+                    message = f"is {source.version}, but {path} has no version; add it there"
+                reader.add_fault(file, f"{where}.version", message)
     tops = (source.folder for chart in config.charts.values() for source in chart.sources())
     folders = (folder for top in tops if top for folder in charts.folders(top, config.files))
     for folder in dict.fromkeys(folders):  # each library once, in the order in which it is needed
         reader.faults += charts.faults(folder, config.files)
 
 
-def _check_chart(
-    file: str, where: str, chart: ChartSource, config: Config, reader: ConfigReader
+def _check_services(  # noqa: PLR0912 - a branch for each fault
+    config: Config, reader: ConfigReader
 ) -> None:
-    if not chart.folder:
-        return
-    path = f"{chart.folder}/Chart.yaml"
-    text = config.files.get(path)
-    if text is None:
-        message = f"'{path}' does not exist; correct the folder"
-        if not path.startswith("appdefs/"):
-            message = f"'{chart.folder}' is not in appdefs/; move the chart there"
-        reader.add_fault(file, f"{where}.folder", message)
-        return
-    try:
-        metadata = strict_yaml.load(text, path)
-    except InvalidInput as error:
-        reader.faults += error.faults
-        return
-    version = metadata.get("version") if isinstance(metadata, dict) else None
-    if version != chart.version:
-        message = f"is {chart.version}, but {path} says {version}; make them equal"
-        if version is None:
-            message = f"is {chart.version}, but {path} has no version; add it there"
-        reader.add_fault(file, f"{where}.version", message)
-
-
-def _check_services(config: Config, reader: ConfigReader) -> None:
     prefixes: dict[str, tuple[str, str]] = {}
     files: dict[str, str] = {}
     words = {connection_type.word for connection_type in connection_types.CONNECTION_TYPES}
@@ -198,9 +188,6 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
                 f"'{service.prefix}' is already the prefix of '{owner[1]}'; choose another prefix"
             )
             reader.add_fault(file, f"{where}prefix", message)
-
-
-def _check_uses(config: Config, reader: ConfigReader) -> None:
     origins: dict[str, tuple[str, str]] = {}
     for name, definition in config.definitions.items():
         file = f"appdefs/{name}/service.yaml"
@@ -227,7 +214,9 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
                 )
 
 
-def _check_versions(config: Config, reader: ConfigReader) -> None:
+def _check_versions(  # noqa: PLR0912 - a branch for each fault
+    config: Config, reader: ConfigReader
+) -> None:
     for name, appdef in config.appdefs.items():
         # an invalid entry may be the missing one
         is_unlisted = not reader.files_of[configs.VERSIONS_FILE] or reader.is_missing(
@@ -239,8 +228,19 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
                 f"the versions of '{name}'; add them there, or remove 'versions'"
             )
             reader.add_fault(f"appdefs/{name}/appdef.yaml", "versions", message)
-        if appdef.versions == "separate":
-            _check_separate(name, config, reader)
+        own = config.services.get(name, {}) if appdef.versions == "separate" else {}
+        for service in own.values():
+            origin = service.inputs[service.each] if service.shared and service.each else ""
+            producer = own.get(origin.partition(".")[0])
+            if producer is not None and not producer.shared:
+                reader.add_fault(
+                    f"appdefs/{name}/appdef.yaml",
+                    f"uses.{service.name}.{service.each}",
+                    f"the shared service '{service.name}' reads '{origin}' and runs once for all "
+                    f"versions, but '{producer.name}' runs once for each version (versions: "
+                    f"separate); make '{producer.name}' a shared service too, or define "
+                    f"'{service.name}' in this appdef",
+                )
     for name, listed in config.versions.items():
         file, place = reader.places[configs.VERSIONS_FILE][name]
         if name not in config.appdefs:
@@ -260,27 +260,22 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
                 _check_used(file, f"{where}.charts.{chart}", chart, charts, name, reader)
                 listed_chart = config.charts.get(chart) if chart in charts else None
                 if listed_chart is not None and listed_chart.at(wanted) is None:
-                    sources = listed_chart.sources()
-                    hint = suggestion(wanted, [source.version for source in sources])
+                    hint = suggestion(wanted, [each.version for each in listed_chart.sources()])
                     registry = config.file_of(configs.CHARTS_FILE, chart)
                     message = f"'{wanted}' is not a version of {chart} in {registry}{hint}"
                     reader.add_fault(file, f"{where}.charts.{chart}", message)
             for image in contents.images:
                 _check_used(file, f"{where}.images.{image}", image, images, name, reader)
-
-
-def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    services = config.services.get(appdef, {})
-    for name, service in services.items():
-        origin = service.inputs[service.each] if service.shared and service.each else ""
-        producer = services.get(origin.partition(".")[0])
-        if producer is not None and not producer.shared:
+    numbers: dict[int, str] = {}
+    for appdef in config.appdefs.values():
+        if appdef.deployment_request is None:
+            continue
+        number = appdef.deployment_request.type
+        other = numbers.setdefault(number, appdef.name)
+        if other != appdef.name:
+            message = f"{number} already names '{other}'; choose another number"
             reader.add_fault(
-                f"appdefs/{appdef}/appdef.yaml",
-                f"uses.{name}.{service.each}",
-                f"the shared service '{name}' reads '{origin}' and runs once for all versions, but "
-                f"'{producer.name}' runs once for each version (versions: separate); make "
-                f"'{producer.name}' a shared service too, or define '{name}' in this appdef",
+                f"appdefs/{appdef.name}/appdef.yaml", "deploymentRequest.type", message
             )
 
 
@@ -290,20 +285,6 @@ def _check_used(
     if name not in used:
         message = f"no service of {appdef} uses '{name}'{suggestion(name, used)}"
         reader.add_fault(file, where, message)
-
-
-def _check_wire_types(config: Config, reader: ConfigReader) -> None:
-    seen: dict[int, str] = {}
-    for appdef in config.appdefs.values():
-        if appdef.deployment_request is None:
-            continue
-        number = appdef.deployment_request.type
-        other = seen.setdefault(number, appdef.name)
-        if other != appdef.name:
-            message = f"{number} already names '{other}'; choose another number"
-            reader.add_fault(
-                f"appdefs/{appdef.name}/appdef.yaml", "deploymentRequest.type", message
-            )
 
 
 def _check_overrides(config: Config, reader: ConfigReader) -> None:

@@ -43,7 +43,7 @@ _ANY = RepoSettings(
 )  # replaces settings that are not valid, so that the other files can be checked
 
 
-def load(files: Mapping[str, str]) -> Config:
+def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each kind of file
     """Return the configuration of a state repo; other files are ignored."""
     reader = ConfigReader(files)
     repository = reader.read_file(ROOT_FILE, RepoSettings)
@@ -105,6 +105,20 @@ def load(files: Mapping[str, str]) -> Config:
         versions = reader.read_items(
             configs.VERSIONS_FILE, registry.VersionsFile, "applications", registry.VersionList
         )
+    overrides: dict[str, Override] = {}
+    for path in sorted(reader.files):
+        folder, _, file = path.partition("/")
+        if folder != OVERRIDES_ROOT or file.startswith(".") or file.endswith(".md"):
+            continue
+        name = file.removesuffix(".yaml")
+        if name == file or not is_override_name(name):
+            message = (
+                "is not an override file; rename it to overrides/<name>.yaml, where <name> has up "
+                "to 63 lower-case letters, digits and '-' between them, or remove it"
+            )
+            reader.add_fault(path, "", message)
+        elif (override := reader.read_file(path, OverrideFile)) is not None:
+            overrides[name] = Override.from_file(name, override)
     entry_files: dict[str, dict[str, str]] = {
         collection: {name: file for name, (file, _) in places.items()}
         for collection, places in reader.places.items()
@@ -125,7 +139,7 @@ def load(files: Mapping[str, str]) -> Config:
         domain_of=domain_of,
         hosts=hosts,
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
-        overrides=_read_overrides(reader),
+        overrides=MappingProxyType(overrides),
         entry_files={**entry_files, configs.CLIENTS_FILE: client_files},
     )
     cross_check(config, reader)
@@ -214,26 +228,6 @@ def _with_short_names(
 
 def is_override_name(name: str) -> bool:
     return _NAME.fullmatch(name) is not None
-
-
-def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
-    overrides = {}
-    for path in sorted(reader.files):
-        folder, _, name = path.partition("/")
-        if folder != OVERRIDES_ROOT or name.startswith(".") or name.endswith(".md"):
-            continue
-        stem = name.removesuffix(".yaml")
-        if stem == name or not is_override_name(stem):
-            message = (
-                "is not an override file; rename it to overrides/<name>.yaml, where <name> has up "
-                "to 63 lower-case letters, digits and '-' between them, or remove it"
-            )
-            reader.add_fault(path, "", message)
-            continue
-        file = reader.read_file(path, OverrideFile)
-        if file is not None:
-            overrides[stem] = Override.from_file(stem, file)
-    return MappingProxyType(overrides)
 
 
 def _in_ros_domain(node: Node, domain: AccessDomain | None) -> Node:

@@ -76,28 +76,21 @@ class DemandGoal(FrozenModel):
     positions: list[GoalPosition] = Field(default_factory=list)
     answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
 
-    def faults(self) -> Iterator[Fault]:
+    def faults(self) -> Iterator[Fault]:  # noqa: PLR0912 - a branch for each fault
         if verb := self.operation if self.operation != "put" else "":
             listed = "applications" if self.applications else "connections"
             remedy = "leave the field out; to change the demand, send a put"
             if verb == "release":
                 remedy = "to release a part of the demand, put the demand without that part"
-            for name, given, message in (
-                (
-                    "lease",
-                    self.lease is not None,
-                    "is set by a put; leave it out, or put the demand again",
-                ),
-                (
-                    listed,
-                    self.applications or self.connections,
-                    f"a {verb} names only its demand; {remedy}",
-                ),
-                ("priority", self.priority, f"a {verb} does not wait for room; leave priority out"),
-                ("positions", self.positions, f"a {verb} chooses no node; leave the positions out"),
-            ):
-                if given:
-                    yield fault(name, message)
+            if self.lease is not None:
+                yield fault("lease", "is set by a put; leave it out, or put the demand again")
+            if self.applications or self.connections:
+                yield fault(listed, f"a {verb} names only its demand; {remedy}")
+            if self.priority:
+                message = f"a {verb} does not wait for room; leave priority out"
+                yield fault("priority", message)
+            if self.positions:
+                yield fault("positions", f"a {verb} chooses no node; leave the positions out")
         for index, app in enumerate(self.applications):
             for role, topics in app.inputs.items():
                 for place, topic in enumerate(topics):
@@ -149,9 +142,18 @@ def _with_parameters(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]
         where, values = f"applications[{index}]", dict(given)
         problems = {f"{where}.parameters.{name}": _value_problem(given[name], 0) for name in given}
         for name, text in texts.items():
-            problem = "is already given in parameters; give it once"
-            if name not in given:
-                values[name], problem = _json_value(text)
+            try:
+                if name in given:
+                    problem = "is already given in parameters; give it once"
+                else:
+                    values[name] = json.loads(text)
+                    problem = _value_problem(values[name], 0)
+            except (json.JSONDecodeError, TypeError):
+                problem = 'is not JSON; text needs its own quotes, as in ""fast""'
+            except RecursionError:
+                problem = _TOO_DEEP
+            except ValueError:  # Python refuses to convert integers of more than 4300 digits
+                problem = "has an integer of too many digits; write a shorter one"
             problems[f"{where}.parameters_json.{name}"] = problem
         faults.extend(fault(field, problem) for field, problem in problems.items() if problem)
         others = {name: value for name, value in app.items() if name != "parameters_json"}
@@ -161,19 +163,6 @@ def _with_parameters(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]
     if isinstance(listed, list):
         goal = goal | {"applications": [read(index, app) for index, app in enumerate(listed)]}
     return goal, faults
-
-
-def _json_value(text: object) -> tuple[Any, str]:
-    """Return the value of a JSON text, or what is wrong with it."""
-    try:
-        value = json.loads(text)  # type: ignore[arg-type]
-    except (json.JSONDecodeError, TypeError):
-        return None, 'is not JSON; text needs its own quotes, as in ""fast""'
-    except RecursionError:
-        return None, _TOO_DEEP
-    except ValueError:  # Python refuses to convert integers of more than 4300 digits
-        return None, "has an integer of too many digits; write a shorter one"
-    return value, _value_problem(value, 0)
 
 
 # How many levels a parameter's value may have. It is a part of a claim's file, which may have 100.

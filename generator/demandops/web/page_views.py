@@ -1,0 +1,347 @@
+"""The page's views, by address: what each finds, and what its template gets."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import timedelta
+from itertools import groupby, islice
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.requests import Request
+
+from demandops.base import strict_yaml
+from demandops.model.config.base_model import parse_time
+from demandops.model.release import ServiceRelease
+from demandops.views import causes as cause_list
+from demandops.views.kinds import KINDS, rows_of
+from demandops.views.rows import TONES, Filter, Row, exactly, page_of, sorted_rows
+from demandops.views.source import RANKS, WORDS, HealthChange, Source
+from demandops.views.why import (
+    commits_of,
+    explain,
+    find,
+    is_released_by_demand_id,
+    last_difference,
+    release_of,
+    stopped_with,
+)
+from demandops.web import fleet_map, time_line
+from demandops.web.follower import MOST_COMMITS, Follower
+from demandops.web.time_line import Event
+
+# The lists of the page, in the order of its navigation.
+LISTS = (
+    "demands",
+    "applications",
+    "releases",
+    "connections",
+    "nodes",
+    "requesters",
+    "leases",
+    "overrides",
+    "proposals",
+)
+NAVIGATION = (
+    ("", "Overview"),
+    ("map", "Map"),
+    *((name, KINDS[name].title) for name in LISTS),
+    ("timeline", "Time line"),
+)
+
+# The parameters that a link to another view keeps: the chosen commit or time, and the filter.
+_KEPT = ("at", "q")
+_ROWS = 100  # that a page of a list has at most
+
+_MOST_CAUSES = 100
+_NEWEST = 8  # changes
+_COMMITS = 20  # of one thing
+
+_THING_TONES = WORDS | {
+    **dict.fromkeys(("runs", "held", "used", "in force", "approved", "exists"), "good"),
+    "kept": "none",
+    **dict.fromkeys(("denied", "suspended", "rejected"), "bad"),
+    **dict.fromkeys(
+        ("waiting", "proposed", "overdue", "partly suspended", "not rendered yet"), "busy"
+    ),
+}
+
+Data = dict[str, Any]
+View = Callable[["ViewRequest"], tuple[str, Data]]
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    text: str
+    view: str = ""  # to which it links, with parameters
+    params: Mapping[str, str] = field(default_factory=dict)
+
+
+class ViewRequest:
+    def __init__(self, follower: Follower, request: Request) -> None:
+        self.follower = follower
+        self.path = request.url.path.strip("/")
+        self.params = dict(request.query_params)
+        self.source: Source = follower.at(self.get("at"))
+        self.filter = Filter(self.get("q"))
+
+    def get(self, name: str) -> str:
+        # an address may have any length
+        return self.params.get(name, "").strip()[:500]
+
+    def page(self) -> int:
+        # `isdigit` accepts "²", of which `int` makes no number
+        text = self.get("page")
+        return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
+
+    def to(self, path: str | None = None, **changes: str | int) -> str:
+        # The address of a view, with the chosen commit or time and the filter. Without ``path``, it
+        # is this view with all its parameters. An empty value removes one.
+        kept = {name: value for name, value in self.params.items() if path is None or name in _KEPT}
+        params = {name: value for name, value in {**kept, **changes}.items() if value != ""}
+        query = f"?{urlencode(params)}" if params else ""
+        return f"/{self.path if path is None else path}{query}"
+
+    def rows(self, name: str) -> list[Row]:
+        return [row for row in rows_of(self.source, name) if self.filter.matches(row)]
+
+    def events(self) -> list[Event]:
+        every = time_line.events(self.follower.history, self.follower.health_changes)
+        return [event for event in every if not self.filter or self.filter.matches(event.row())]
+
+    def link(self, part: Part) -> str:
+        # with its own filter instead of the current one
+        return self.to(part.view, **{"q": "", **part.params})
+
+
+def _overview(asked: ViewRequest) -> tuple[str, Data]:
+    source = asked.source
+    # The fleet in figures: a number and what it counts, which links to a list; and what stands out
+    # of that list, with its color.
+    demands = asked.rows("demands")
+    figures: list[Data] = []
+    for name in ("releases", "connections", "demands", "requesters"):
+        rows = demands if name == "demands" else asked.rows(name)
+        counts = Counter(row.item["health"] or "unknown" for row in rows)
+        parts = [
+            (Part(f"{count} {word}", name, {"q": exactly("health", word)}), TONES[word])
+            for word, count in sorted(counts.items(), key=lambda pair: RANKS[pair[0]])
+        ]
+        what = Part(name.removesuffix("s") if len(rows) == 1 else name, name)
+        figures.append({"count": len(rows), "what": what, "parts": parts})
+    used = [row for row in asked.rows("nodes") if row.item["demands"] and row.item["type"]]
+    what = Part(f"of {len(source.config.nodes)} nodes used", "nodes")
+    figures.append({"count": len(used), "what": what, "parts": ()})
+    proposed = len(source.proposals)
+    waiting = sum(row.item["state"] == "waiting" for row in demands)
+    parts = []
+    if proposed:
+        parts.append((Part(f"{proposed} for approval", "proposals"), "busy"))
+    if waiting:
+        rows_waiting = {"q": exactly("state", "waiting")}
+        parts.append((Part(f"{waiting} for room", "demands", rows_waiting), "busy"))
+    what = Part("waiting", "proposals")
+    figures.append({"count": proposed + waiting, "what": what, "parts": parts})
+    moment = source.now if source.is_newest else source.entry.time
+    events = [event for event in asked.events() if event.time <= moment]
+    parts, late = [], list[int]()
+    for span, hours in (("hour", 1), ("day", 24)):
+        recent = [event for event in events if event.time >= moment - timedelta(hours=hours)]
+        booked = sum(event.word in time_line.BOOKED for event in recent)
+        released = sum(event.word in time_line.RELEASED for event in recent)
+        parts.append((Part(f"{booked} booked, {released} released in the last {span}"), ""))
+        late.append(len(recent))
+    changes = "change" if late[0] == 1 else "changes"
+    what = Part(f"{changes} in the last hour", "timeline", {"span": "1h"})
+    figures.append({"count": late[0], "what": what, "parts": parts})
+
+    # What is not ready, with a link to the thing or to the releases that it is about.
+    causes = [
+        cause for cause in cause_list.causes(source) if asked.filter.matches(Row(cause.labels))
+    ]
+    links = []
+    for cause in causes[:_MOST_CAUSES]:
+        (kind, name), link = cause.thing, Part(cause.what)
+        if kind:
+            link = Part(cause.what, "thing", {"kind": kind, "name": name})
+        elif cause.releases:
+            query = f"{exactly('cluster', cause.cluster)} {exactly('health', cause.kind)}"
+            link = Part(cause.what, "releases", {"q": query})
+        links.append((cause, link))
+
+    # Each application with a word for its health and its worst cause. What runs well may still be
+    # denied or invalid. Then the kind of the cause says more.
+    worst: dict[str, cause_list.Cause] = {}
+    for cause in causes:
+        for name in cause.applications:
+            worst.setdefault(name, cause)
+    applications = []
+    for row in asked.rows("applications"):
+        name, word = row.item["name"], row.item["health"] or "unknown"
+        first = worst.get(name)
+        is_said = word not in ("healthy", "unknown")
+        applications.append((name, first.kind if first and not is_said else word, first))
+
+    # The newest changes, with how many releases have the same change of health after one another.
+    newest = groupby(events, lambda event: event.commit or (event.summary, event.tone))
+    groups = ([*same] for _, same in islice(newest, _NEWEST))
+    return "overview.html.j2", {
+        "figures": figures,
+        "causes": links,
+        "total": len(causes),
+        "applications": sorted(applications, key=lambda each: (each[2] is None, each[0])),
+        "tones": {**WORDS, **cause_list.KINDS},
+        "events": [(group[0], len(group)) for group in groups],
+        "overrides": source.overrides,
+    }
+
+
+def _list(asked: ViewRequest) -> tuple[str, Data]:
+    kind, now, sort = KINDS[asked.path], asked.source.now, asked.get("sort")
+    every = rows_of(asked.source, asked.path)
+    matching = [row for row in every if asked.filter.matches(row)]
+    columns = {column.key: column for column in kind.columns if not column.only_wide}
+    if (key := sort.removeprefix("-")) in columns:  # `-` before a key is the reverse order
+        matching = sorted_rows(matching, columns[key], now, down=sort.startswith("-"))
+    shown, page, pages = page_of(matching, asked.page(), _ROWS)
+    rows: list[list[Data]] = [[] for _ in shown]
+    used: set[str] = set()  # of the columns that only some rows fill, those that a shown row fills
+    for row, cells in zip(shown, rows, strict=True):
+        for column in kind.columns:
+            if column.only_wide and column.form != "command":
+                continue
+            texts = column.texts(row.item, now)
+            time = row.item.get(column.key) if column.form == "time" else None  # instead of texts
+            tone = TONES.get(texts[0], "none") if column.form == "state" and texts else ""
+            # what is held is an application or a connection, so it has no kind
+            params = {} if column.links == "held" else {"kind": column.links}
+            parts = [
+                Part(text, "thing", params | {"name": text}) if column.links else Part(text)
+                for text in texts
+            ]
+            at = parse_time(time) if time else None
+            cells.append({"column": column, "parts": parts, "time": at, "tone": tone})
+            if parts:
+                used.add(column.key)
+    return "list.html.j2", {
+        "kind": kind,
+        "columns": [c for key, c in columns.items() if key in used or not shown],
+        "rows": rows,
+        "total": len(every),
+        "matching": len(matching),
+        "sort": sort,
+        "page": page,
+        "pages": pages,
+    }
+
+
+def _timeline(asked: ViewRequest) -> tuple[str, Data]:
+    now, lane = asked.source, asked.get("lane")
+    lanes = {lane} if lane in time_line.LANES else time_line.LANES
+    events = [event for event in asked.events() if event.lane in lanes]
+    span, events = time_line.within(events, asked.get("span"), now.now)
+    chosen = None if now.is_newest else (now.entry.time, now.commit)
+    changed: list[str] = []
+    if asked.get("at"):
+        changed = now.reader().files_changed_by(now.commit)
+    shown, page, pages = page_of(events, asked.page(), size=50)
+    return "timeline.html.j2", {
+        "strip": time_line.strip(events, now.now, span, chosen),
+        "span": span,
+        "lanes": time_line.LANES,
+        "lane": lane,
+        "spans": time_line.SPANS,
+        "events": shown,
+        "total": len(events),
+        "page": page,
+        "pages": pages,
+        "changed": changed,
+        "is_cut": len(asked.follower.history) >= MOST_COMMITS,
+    }
+
+
+def _thing(asked: ViewRequest) -> tuple[str, Data]:
+    # `/demand?id=` and `/release?name=` are in people's bookmarks
+    kind = asked.get("kind") if asked.path == "thing" else asked.path
+    name = asked.get("id") or asked.get("name")
+    health = asked.follower.health_changes if asked.source.is_newest else ()
+    return "thing.html.j2", thing(asked.source, name, kind, health)
+
+
+def thing(source: Source, name: str, kind: str, health: Iterable[HealthChange]) -> Data:
+    # what it is, why, what it holds, its time line, and what to do
+    answer = explain(source, find(source, name, kind or None), _COMMITS)
+    kind, name, word = answer["kind"], answer["name"], answer["state"]
+    runs = kind == "release" and word == "runs"
+    if runs:
+        word = answer["health"] or "unknown"
+    # the commits and the changes of health that touch it, newest first
+    events = [
+        {
+            "time": parse_time(commit["time"]),
+            "word": did,
+            "who": commit["author"],
+            "summary": commit["summary"],
+            "why": commit["why"] or "",
+            "decision": commit["decision"],
+            "commit": commit["commit"],
+        }
+        for did, commit in commits_of(answer)
+    ]
+    names = {name, *(release["name"] for release in answer.get("releases", ()))}
+    for event in time_line.events((), (change for change in health if change.release in names)):
+        summary = f"{event.release} {event.summary}"
+        shown = {"time": event.time, "word": event.word, "summary": summary, "who": ""}
+        events.append(shown | {"why": "", "decision": None, "commit": ""})
+    data: Data = {
+        "it": answer,
+        "word": word,
+        "tone": _THING_TONES.get(word, "none"),
+        "tones": _THING_TONES,
+        "time_line": sorted(events, key=lambda event: event["time"], reverse=True),
+        "difference": last_difference(source, answer),
+        "text": answer["file"] and source.reader().file_reader(source.commit)(answer["file"]),
+        "released": None,
+        "stopped_with": [],
+        "denial": "",
+    }
+    if kind == "demand" and answer["claims"]:
+        goal, released, refused = release_of(source, name)
+        by_id = is_released_by_demand_id(source.claims_of_demands[name][0])
+        goal_text = strict_yaml.dump(goal) if by_id else ""
+        data |= {"released": released, "refused": refused, "goal": goal_text}
+    if runs:
+        release = source.releases[name]
+        if isinstance(release, ServiceRelease):
+            selector = {"services": [release.key.service], "nodes": [release.node.id]}
+        else:
+            selector = {"connections": list(release.connections)}
+        data["stopped_with"] = stopped_with(source, name)
+        data["denial"] = strict_yaml.dump(
+            {
+                "apiVersion": "demandops/v1",
+                "kind": "Override",
+                "select": [selector],
+                "deny": True,
+                "owner": "your name or team",
+                "reason": "why",
+                "expires": f"{source.now:%Y-%m-%d}T23:59:59Z",
+            }
+        )
+    return data
+
+
+VIEWS: Mapping[str, View] = {
+    "/": _overview,
+    "/map": lambda asked: (
+        "map.html.j2",
+        {"map": fleet_map.picture(asked.source, asked.filter, asked.get("layout"))},
+    ),
+    **{f"/{name}": _list for name in (*LISTS, "services")},
+    "/thing": _thing,
+    "/demand": _thing,
+    "/release": _thing,
+    "/timeline": _timeline,
+}
