@@ -79,6 +79,13 @@ def test_it_costs_a_fetch_to_look_at_a_url(tmp_path: Path) -> None:
     assert (pushed.always_current, pushed.on_this_disk) == (False, True)
 
 
+def test_what_a_remote_has_confirmed_is_not_written_to_the_clone_again(tmp_path: Path) -> None:
+    repository = connect(_with_main(tmp_path / "state.git").as_uri(), tmp_path / "data")
+    repository.write_anew("")
+    # a `main` of the clone's own would soon be outdated, and people may write `main`
+    assert [*repository.reopened().references] == ["refs/remotes/origin/main"]
+
+
 def test_the_clone_keeps_its_address_for_its_owner_alone(tmp_path: Path) -> None:
     source = _with_main(tmp_path / "state.git")
     connect(source.as_uri(), tmp_path / "data")

@@ -298,6 +298,9 @@ class RemoteRepository(StateRepository):
             log.warning(text, commit, self._folder, error)
         return True
 
+    def write_anew(self, since: str) -> None:
+        pass  # the remote has synced what it confirms
+
     def list_references(self, *patterns: str) -> dict[str, str]:
         listed = self._run_git("ls-remote", "--quiet", self._url, *patterns)
         if listed.code or listed.is_page:
