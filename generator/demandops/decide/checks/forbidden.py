@@ -312,10 +312,7 @@ def _version_text(word: str, version: ApplicationVersion) -> str:
 
 
 def _of_service(
-    release: ServiceRelease,
-    demanded: Mapping[str, tuple[Item, str]],
-    before: World,
-    after: World,
+    release: ServiceRelease, demanded: Mapping[str, tuple[Item, str]], before: World, after: World
 ) -> Iterator[Difference]:
     """Yield the differences of demanded applications, each with the version it asks for."""
     service, key, config = release.service, release.key, after.config
