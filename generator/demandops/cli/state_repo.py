@@ -325,6 +325,9 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
 
 # ---- ``demandops journal``: accepted demands that are yet to be published ----
 
+# How long a running generator is waited for, which gives up a demand.
+_DROP_S = 15.0
+
 
 @click.command()
 @target.writable_repo_option
@@ -358,7 +361,19 @@ def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> 
     """
     folder = settings.data_home(state_repo)
     if drop is not None:
-        _drop(folder, drop, output)
+        request, end = drop_demand(folder, drop), REAL.monotonic() + _DROP_S
+        while request and request.exists() and REAL.monotonic() < end:
+            REAL.sleep(0.1)
+        outcome = "dropped" if not request else "requested" if request.exists() else "answered"
+        text = {
+            "dropped": "is given up; if its generator died after the push, it is booked, which "
+            "`demandops log` shows",
+            "answered": "has its answer from the generator that runs, whose log has it too",
+            "requested": "is given up by the generator that runs as soon as the state repo shows "
+            "that no push of it has arrived",
+        }
+        data = {"operation_id": drop, "outcome": outcome}
+        show(output, data, [f"demand {drop} {text[outcome]}"])
         return
     journals = list(find_journals(folder, REAL.now(), set_aside=set_aside))
     rows, lines = [], []
@@ -389,22 +404,3 @@ def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> 
     show(output, rows, [*lines, f"{number} {what} accepted and not published"])
     if any(each.damage and not each.set_aside for each in journals):
         raise click.exceptions.Exit(1)
-
-
-_DROP_S = 15.0
-
-
-def _drop(folder: Path, operation: str, output: str) -> None:
-    request, end = drop_demand(folder, operation), REAL.monotonic() + _DROP_S
-    while request and request.exists() and REAL.monotonic() < end:
-        REAL.sleep(0.1)
-    outcome = "dropped" if not request else "requested" if request.exists() else "answered"
-    text = {
-        "dropped": "is given up; if its generator died after the push, it is booked, which "
-        "`demandops log` shows",
-        "answered": "has its answer from the generator that runs, whose log has it too",
-        "requested": "is given up by the generator that runs as soon as the state repo shows that "
-        "no push of it has arrived",
-    }
-    data = {"operation_id": operation, "outcome": outcome}
-    show(output, data, [f"demand {operation} {text[outcome]}"])

@@ -125,46 +125,34 @@ def _denied(source: Source) -> Iterator[Cause]:
     by_override: dict[str, tuple[Override, list[Claim]]] = {}
     for claim, override in suspended_claims(source.state):
         by_override.setdefault(override.name, (override, []))[1].append(claim)
-    for override, claims in by_override.values():
-        what = " and ".join(dict.fromkeys(claim.subject.id for claim in claims))
-        applications = _applications_with(source, claims)
-        thing = "override", override.name
-        yield _denial(source, override, thing, what, "is booked", claims, applications)
+    denials: list[tuple[Override, tuple[str, str], str, list[Claim], Iterable[str]]] = [
+        (override, ("override", override.name), "", claims, _applications_with(source, claims))
+        for override, claims in by_override.values()
+    ]
     # the claims that need a denied release are not suspended as a whole
     for release, override in source.denied:
         claims = claims_behind(source.active.ledger, release)
         served = release.applications if isinstance(release, ServiceRelease) else ()
-        what, thing = release.description, ("release", release.name)
-        yield _denial(source, override, thing, what, "is needed", claims, served, release.name)
-
-
-def _denial(
-    source: Source,
-    override: Override,
-    thing: tuple[str, str],
-    what: str,
-    state: str,
-    claims: Sequence[Claim],
-    applications: Iterable[str],
-    *releases: str,
-) -> Cause:
-    change = source.last_change(override.path)
-    end = f", or wait until the override ends at {override.expires}" if override.expires else ""
-    return Cause(
-        "suspended",
-        what,
-        f"{state}, but {override.path} denies it",
-        f"{override.owner}, who owns the override",
-        f"remove the file by pull request{end}",
-        shlex.join(["git", "rm", override.path]),
-        change.time if change else None,
-        told=override.reason,
-        thing=thing,
-        releases=releases,
-        applications=tuple(dict.fromkeys(applications)),
-        requesters=requesters_of(claims),
-        demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
-    )
+        thing = "release", release.name
+        denials.append((override, thing, release.description, claims, served))
+    for override, thing, needed, claims, applications in denials:
+        change = source.last_change(override.path)
+        end = f", or wait until the override ends at {override.expires}" if override.expires else ""
+        yield Cause(
+            "suspended",
+            needed or " and ".join(dict.fromkeys(claim.subject.id for claim in claims)),
+            f"{'is needed' if needed else 'is booked'}, but {override.path} denies it",
+            f"{override.owner}, who owns the override",
+            f"remove the file by pull request{end}",
+            shlex.join(["git", "rm", override.path]),
+            change.time if change else None,
+            told=override.reason,
+            thing=thing,
+            releases=(thing[1],) if needed else (),
+            applications=tuple(dict.fromkeys(applications)),
+            requesters=requesters_of(claims),
+            demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
+        )
 
 
 def _applications_with(source: Source, claims: Iterable[Claim]) -> Iterator[str]:

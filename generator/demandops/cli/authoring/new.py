@@ -196,34 +196,32 @@ def _image(text: str) -> Image:
     return Image(repository=image.name, tag=image.tag or None, digest=image.digest or None)
 
 
-# Maps an option to the question that asks for its values, what reads a value, and how many may be
-# given; None means any number.
-_QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
+# Maps an option to the question that asks for its values, and what reads a value.
+_QUESTIONS: Mapping[str, tuple[str, Callable[[str], object]]] = {
     "--input": (
         "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; separate several by spaces",
         _input,
-        None,
     ),
     "--service": (
         "Services, as name=package/file, such as detector=my_package/detector.launch.py; separate "
         "several by spaces",
         _service,
-        None,
     ),
-    "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
+    "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image),
 }
 
 
-def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
-    """Ask until the answer is at most ``most`` valid words; ``check`` raises for another word."""
+def _asked(option: str) -> tuple[str, ...]:
+    # until the answer has only words that are valid
+    question, check = _QUESTIONS[option]
 
     def valid(answer: str) -> tuple[str, ...]:
         if not (words := tuple(answer.split())):
             raise click.UsageError(
                 "an answer is needed; Ctrl-C ends the command, and nothing is written"
             )
-        if most is not None and len(words) > most:
-            raise click.UsageError(f"'{answer}' has {len(words)} words; give {most}")
+        if option == "--image" and len(words) > 1:
+            raise click.UsageError(f"'{answer}' has {len(words)} words; give 1")
         for word in words:
             check(word)
         return words
@@ -297,7 +295,7 @@ def application(  # noqa: PLR0913 - as many as options
     if missing and not sys.stdin.isatty():
         options = ", ".join(f"'{option}'" for option in missing)
         raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
-    values = {option: given[option] or _asked(*_QUESTIONS[option]) for option in given}
+    values = {option: given[option] or _asked(option) for option in given}
     planned = [_service(text) for text in values["--service"]]
     types = dict(map(_input, values["--input"]))
     pulled = _image(values["--image"][0])
