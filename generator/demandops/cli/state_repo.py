@@ -202,31 +202,27 @@ def upgrade(
             done.extend([f"upgraded in {result.commit}"] if result.files else [])
     old, new = result.old.repo_settings, result.new.repo_settings
     outcome = "unchanged" if not result.files else "would-change" if dry_run else "upgraded"
-    data = {
+    data: Json = {
         "outcome": outcome,
         "commit": result.commit,
         "render_version": {"from": old.render_version, "to": new.render_version},
         "gitops": {"from": old.gitops, "to": new.gitops},
         "written": [path for path, text in result.files.items() if text is not None],
         "removed": [path for path, text in result.files.items() if text is None],
-        "after": _steps_after(result),
+        "after": [
+            {
+                "cluster": cluster,
+                "what": "apply the cluster's bootstrap file again, because the file changed",
+                "commands": [f"git show main:{path} | kubectl apply -f -"],
+            }
+            for cluster in domains_by_cluster(result.new)
+            if (path := bootstrap_path(cluster)) in result.files
+        ],
     }
-    show(output, data, _upgrade_lines(result, dry_run))
+    show(output, data, _upgrade_lines(result, data["after"], dry_run))
 
 
-def _steps_after(result: Upgrade) -> list[Json]:
-    return [
-        {
-            "cluster": cluster,
-            "what": "apply the cluster's bootstrap file again, because the file changed",
-            "commands": [f"git show main:{path} | kubectl apply -f -"],
-        }
-        for cluster in domains_by_cluster(result.new)
-        if (path := bootstrap_path(cluster)) in result.files
-    ]
-
-
-def _upgrade_lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
+def _upgrade_lines(result: Upgrade, steps: list[Json], dry_run: bool) -> Iterator[str]:
     old, new = result.old.repo_settings, result.new.repo_settings
     if not result.files:
         yield (
@@ -251,7 +247,7 @@ def _upgrade_lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
         yield f"  and {len(result.files) - _MOST_PATHS} more (--output json lists all)"
     if result.switches:
         yield f"\n{_SWITCH}"
-    if steps := _steps_after(result):
+    if steps:
         yield "\nafter the upgrade, on the clusters:"
     for step in steps:
         yield f"- {step['cluster']}: {step['what']}"

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import datetime, timezone
 from typing import Any
 
 from rich.cells import cell_len
 
 from demandops.base.quoting import one_line
+from demandops.model.config.base_model import parse_time
 from demandops.views.kinds import Kind
-from demandops.views.rows import TONES, Column, Row, utc
+from demandops.views.rows import TONES, Column, Row
 from demandops.views.vocabulary import Json
 
 _GAP = "  "
@@ -147,5 +148,7 @@ def list_table(kind: Kind, rows: Sequence[Row], now: datetime, *, wide: bool = F
         if column.form == "time":  # and when that was by the clock
             columns.append(Column(column.key, f"{column.title} (UTC)"))
             for row, texts in zip(rows, cells, strict=True):
-                texts.append([utc(time)] if (time := row.item[column.key]) else [])
+                since = parse_time(time) if (time := row.item[column.key]) else None
+                clock = since and f"{since.astimezone(timezone.utc):%Y-%m-%d %H:%M:%S}"
+                texts.append([clock] if clock else [])
     return Table(columns, cells, empty=f"no {kind.name}", styles=STYLES, whole=wide)

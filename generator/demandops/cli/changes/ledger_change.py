@@ -25,7 +25,7 @@ from demandops.cli.changes.person_change import (
 from demandops.cli.json_output import show
 from demandops.cli.output import busy, done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.diff import resolved
-from demandops.cli.target import names_of
+from demandops.cli.target import name_options, names_of
 from demandops.decide.decision import decide
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS
@@ -256,19 +256,13 @@ def decommission(name: str, kind: str | None, options: Options) -> None:
 
 @click.command()
 @click.argument("revision", metavar="REV|TIME")
-@click.option(
-    "--demand",
+@name_options(
+    {
+        "demand": "Roll back only this demand.",
+        "application": "Roll back only this application, with the connections of its demands.",
+    },
     metavar="ID",
     default="",
-    shell_complete=names_of("demands"),
-    help="Roll back only this demand.",
-)
-@click.option(
-    "--application",
-    metavar="ID",
-    default="",
-    shell_complete=names_of("applications"),
-    help="Roll back only this application, with the connections of its demands.",
 )
 @click.option(
     "--drop-newer",

@@ -12,7 +12,7 @@ from demandops.base.runtime import REAL
 from demandops.cli.json_output import output_formats, output_option, show
 from demandops.cli.output import at_option, busy, fitted, terminal_width
 from demandops.cli.queries.diff import loaded
-from demandops.cli.target import names_of, state_repo_option
+from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.decide.admission.may import may_demand
 from demandops.model.config.base_model import duration_text
 from demandops.repo import reader
@@ -224,13 +224,7 @@ def why(
 @click.argument("requester", metavar="REQUESTER", shell_complete=names_of("requesters"))
 @click.argument("verb", type=click.Choice(["demand"]), metavar="demand")
 @click.argument("application", metavar="APPLICATION", shell_complete=names_of("appdefs"))
-@click.option(
-    "--node",
-    metavar="NODE",
-    default="",
-    shell_complete=names_of("nodes"),
-    help="On this node. Default: on any.",
-)
+@name_options({"node": "On this node. Default: on any."}, metavar="NODE", default="")
 @click.option("--version", metavar="VERSION", default="", help="In this version.")
 @state_repo_option
 @output_option
