@@ -28,7 +28,7 @@ from demandops.repo.git import child_processes
 # The package of each command's module, and the short help, which `--help` shows without importing
 # the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.
 COMMANDS = {
-    "approve": ("changes.approve", "Approve a proposal: merge its branch in your own name."),
+    "approve": ("changes.person_change", "Approve a proposal: merge its branch in your own name."),
     "bookkeeping": ("queries.diff", "Show who requests which service and connection."),
     "check": ("authoring.check", "Check edits of a state repo and show their consequences."),
     "completion": ("program", "Print the completion script for a shell."),
@@ -60,7 +60,10 @@ COMMANDS = {
         "queries.status",
         "Let Flux or Argo CD fetch now, and not at its next interval.",
     ),
-    "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),
+    "reject": (
+        "changes.person_change",
+        "Reject a proposal: delete its branch, and record who and why.",
+    ),
     "resume": ("changes.configure", "Run suspended applications and connections again."),
     "revert": ("changes.configure", "Undo a person's commit, by a new commit."),
     "rollback": (
@@ -78,8 +81,8 @@ COMMANDS = {
     "upgrade": ("state_repo", "Render everything again, in one commit."),
     "verify": ("state_repo", "Render commits again from their ledger and compare the bytes."),
     "version": ("program", "Print the versions of the program and of its formats."),
-    "watch": ("queries.live", "Show releases, demands and the latest commits live."),
-    "web": ("queries.live", "Show the state repo on a web page."),
+    "watch": ("queries.status", "Show releases, demands and the latest commits live."),
+    "web": ("queries.status", "Show the state repo on a web page."),
     "why": ("queries.why", "Explain why something runs or ran, and who decided it."),
 }
 

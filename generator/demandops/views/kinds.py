@@ -20,7 +20,6 @@ from demandops.decide.bookkeeping import (
     service_entry,
     versions_asked,
 )
-from demandops.decide.override_report import Entry
 from demandops.decide.planning.overrides import suspended_by
 from demandops.model.config.base_model import duration_text, parse_time, relative
 from demandops.model.config.config import DOMAINS_FILE
@@ -555,16 +554,13 @@ def _appdefs(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 def _overrides(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     for entry in source.overrides:
-        yield entry.override.name, (entry,)
-
-
-def _override(source: Source, entry: Entry) -> Json:
-    return {
-        **vocabulary.override_data(entry.override),
-        "state": entry.state,
-        "releases": [vocabulary.release_data(release) for release in entry.releases],
-        "claims": [claim_data(claim) for claim in entry.claims],
-    }
+        item = {
+            **vocabulary.override_data(entry.override),
+            "state": entry.state,
+            "releases": [vocabulary.release_data(release) for release in entry.releases],
+            "claims": [claim_data(claim) for claim in entry.claims],
+        }
+        yield entry.override.name, (item,)
 
 
 def effect_texts(override: Json, *_: object) -> list[str]:
@@ -780,8 +776,7 @@ KINDS: dict[str, Kind] = {
                 _command("End it", lambda item: ["demandops", "override", "end", item["name"]]),
             ),
             _overrides,
-            _override,
-            lambda item: {
+            labels=lambda item: {
                 **{
                     key: [release[key] for release in item["releases"]]
                     for key in ("node", "domain", "cluster")

@@ -161,38 +161,24 @@ class _Service:
 
 def _input(text: str) -> tuple[str, str]:
     if not (match := _INPUT.fullmatch(text)):
-        raise click.BadParameter(
-            f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image",
-            param_hint="--input",
-        )
+        raise ValueError(f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image")
     if short := _SHORT_TYPE.fullmatch(match["type"]):
-        raise click.BadParameter(
-            f"'{text}' has no message type of ROS 2; write "
-            f"{match['role']}={short['package']}/msg/{short['name']}",
-            param_hint="--input",
-        )
+        full = f"{match['role']}={short['package']}/msg/{short['name']}"
+        raise ValueError(f"'{text}' has no message type of ROS 2; write {full}")
     return match["role"], match["type"]
 
 
 def _service(text: str) -> _Service:
     if not (match := _SERVICE.fullmatch(text)):
-        raise click.BadParameter(
-            f"'{text}' is not NAME=PACKAGE/FILE; write it like "
-            "detector=my_package/detector.launch.py",
-            param_hint="--service",
-        )
+        example = "detector=my_package/detector.launch.py"
+        raise ValueError(f"'{text}' is not NAME=PACKAGE/FILE; write it like {example}")
     return _Service(match["name"], match["package"], match["file"])
 
 
 def _image(text: str) -> Image:
-    try:
-        image = addresses.image(text)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--image") from None
+    image = addresses.image(text)
     if not (image.tag or image.digest):
-        raise click.BadParameter(
-            f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
-        )
+        raise ValueError(f"'{text}' has no tag or digest; write {text}:TAG")
     return Image(repository=image.name, tag=image.tag or None, digest=image.digest or None)
 
 
@@ -211,10 +197,15 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object]]] = {
 }
 
 
+def _read(option: str, word: str) -> Any:  # noqa: ANN401
+    try:
+        return _QUESTIONS[option][1](word)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint=option) from None
+
+
 def _asked(option: str) -> tuple[str, ...]:
     # until the answer has only words that are valid
-    question, check = _QUESTIONS[option]
-
     def valid(answer: str) -> tuple[str, ...]:
         if not (words := tuple(answer.split())):
             raise click.UsageError(
@@ -223,11 +214,11 @@ def _asked(option: str) -> tuple[str, ...]:
         if option == "--image" and len(words) > 1:
             raise click.UsageError(f"'{answer}' has {len(words)} words; give 1")
         for word in words:
-            check(word)
+            _read(option, word)
         return words
 
     words: tuple[str, ...]
-    words = click.prompt(question, default="", show_default=False, value_proc=valid)
+    words = click.prompt(_QUESTIONS[option][0], default="", show_default=False, value_proc=valid)
     return words
 
 
@@ -296,9 +287,9 @@ def application(  # noqa: PLR0913 - as many as options
         options = ", ".join(f"'{option}'" for option in missing)
         raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
     values = {option: given[option] or _asked(option) for option in given}
-    planned = [_service(text) for text in values["--service"]]
-    types = dict(map(_input, values["--input"]))
-    pulled = _image(values["--image"][0])
+    planned: list[_Service] = [_read("--service", word) for word in values["--service"]]
+    types = dict(_read("--input", word) for word in values["--input"])
+    pulled = _read("--image", values["--image"][0])
     # a demand can name only nodes in an access domain
     nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
     if not (node or nodes):
