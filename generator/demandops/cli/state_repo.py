@@ -14,7 +14,7 @@ from demandops.base.errors import StateRepoError, fault
 from demandops.base.runtime import REAL
 from demandops.cli import target
 from demandops.cli.authoring import schema
-from demandops.cli.json_output import output_option, show
+from demandops.cli.formats import output_option, show
 from demandops.cli.output import busy, done, errors, progress
 from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader

@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from demandops.base.quoting import lines, one_line
-from demandops.cli.json_output import output_formats, print_json
+from demandops.cli.formats import output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.queries.diff import entry_lines, release_lines
 from demandops.decide.bookkeeping import EntryChange

@@ -17,7 +17,7 @@ from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.naming import PATTERN_WORDS
 from demandops.base.quoting import quoted
 from demandops.base.settings import data_folder
-from demandops.cli.json_output import Command, output_option, show
+from demandops.cli.formats import Command, output_option, show
 from demandops.cli.output import busy
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.decide.state import State, try_configuration

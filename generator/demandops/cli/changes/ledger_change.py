@@ -22,7 +22,7 @@ from demandops.cli.changes.person_change import (
     consequence,
     warned_if_unnamed,
 )
-from demandops.cli.json_output import show
+from demandops.cli.formats import show
 from demandops.cli.output import busy, done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.diff import resolved
 from demandops.cli.target import name_options, names_of

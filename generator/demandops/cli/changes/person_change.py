@@ -24,7 +24,7 @@ from demandops.base.errors import InvalidInput, suggestion
 from demandops.base.quoting import harmless, one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
-from demandops.cli import json_output, target
+from demandops.cli import formats, target
 from demandops.cli.output import done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.diff import differences, entry_lines, release_lines
 from demandops.decide.changeset import (
@@ -108,7 +108,7 @@ def changing(
             ),
             target.writable_repo_option,
             target.signing_option,
-            json_output.output_option,
+            formats.output_option,
         )(run)
 
     return add
@@ -228,7 +228,7 @@ def commit(
             file = FileChange(path, current(path), content)
             diff = file.diff() if file.before else (content or "").splitlines()
             shown += [f"    {line}" for line in diff]
-        json_output.show(options.output, data, [*told, *shown, "nothing was changed"])
+        formats.show(options.output, data, [*told, *shown, "nothing was changed"])
         return
     for line in told if options.output == "text" else ():
         errors.print(line)
@@ -262,7 +262,7 @@ def commit(
         "commit": published.commit,
         "branch": published.branch,
     }
-    json_output.show(options.output, data, told)
+    formats.show(options.output, data, told)
 
 
 # ---- ``demandops approve``: merge a proposal in the caller's own name ----
@@ -357,7 +357,7 @@ def approve(name: str, commit: str, options: Options) -> None:
         if proposal.branch.startswith(OF_PEOPLE):  # a generator removes only its own branches
             _remove(repo, proposal)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": merged.commit}
-    json_output.show(
+    formats.show(
         options.output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"]
     )
 
@@ -394,7 +394,7 @@ def reject(name: str, commit: str, options: Options) -> None:
         _remove(repo, proposal)
     data = {"outcome": "rejected", "branch": proposal.branch, "commit": recorded}
     where = f"recorded in {recorded}, " if recorded else ""
-    json_output.show(options.output, data, [f"rejected: {where}{proposal.branch} is deleted"])
+    formats.show(options.output, data, [f"rejected: {where}{proposal.branch} is deleted"])
 
 
 def _remove(repo: Reader, proposal: PendingProposal) -> None:

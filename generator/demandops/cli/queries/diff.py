@@ -8,9 +8,8 @@ from dataclasses import asdict, replace
 import click
 
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import output_formats, output_option, show
+from demandops.cli.formats import Table, list_table, output_formats, output_option, show, table_of
 from demandops.cli.output import SIGNS, at_option, errors, progress, warn_of_problems
-from demandops.cli.table import Table, list_table, table_of
 from demandops.cli.target import state_repo_option
 from demandops.decide.bookkeeping import EntryChange, as_data, bookkeeping_changes
 from demandops.decide.bookkeeping import bookkeeping as derive

@@ -12,10 +12,9 @@ import click
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import output_formats, show
+from demandops.cli.formats import Table, list_table, output_formats, show
 from demandops.cli.output import busy
 from demandops.cli.queries.diff import resolved
-from demandops.cli.table import Table, list_table
 from demandops.cli.target import name_options, state_repo_option
 from demandops.repo import reader
 from demandops.repo.history import revisions

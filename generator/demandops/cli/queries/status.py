@@ -15,7 +15,7 @@ import click
 
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import output_option, show
+from demandops.cli.formats import Table, list_table, output_option, show
 from demandops.cli.output import (
     busy,
     errors,
@@ -26,7 +26,6 @@ from demandops.cli.output import (
     warn_of_not_rendered,
 )
 from demandops.cli.queries.log import log_table
-from demandops.cli.table import Table, list_table
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
 from demandops.cluster.clusters_file import ClusterAccess
