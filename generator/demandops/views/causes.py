@@ -25,7 +25,6 @@ KINDS: dict[str, str] = {
     **dict.fromkeys(("unread", "failing", "invalid", "suspended"), "bad"),
     **dict.fromkeys(("decision", "waiting", "starting"), "busy"),
 }
-_PLACES = {kind: place for place, kind in enumerate(KINDS)}
 
 # What kubelet and the scheduler write into a pod's status, which the reason of a release quotes.
 _IMAGE = re.compile(r"ImagePull|ErrImage|InvalidImage|manifest unknown|pull access denied", re.I)
@@ -74,13 +73,9 @@ class Cause:
 
 def causes(source: Source) -> list[Cause]:
     """Return every cause, the worst kind first, then the oldest."""
-    every = [
-        *_unread_or_invalid(source),
-        *_denied(source),
-        *_not_ready(source),
-        *_awaited(source),
-    ]
-    every.sort(key=lambda cause: (_PLACES[cause.kind], cause.since or source.now))
+    every = [*_unread_or_invalid(source), *_denied(source)]
+    every += [*_not_ready(source), *_awaited(source)]
+    every.sort(key=lambda cause: ([*KINDS].index(cause.kind), cause.since or source.now))
     return every
 
 
