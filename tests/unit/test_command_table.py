@@ -15,7 +15,7 @@ import click
 import demandops
 import pytest
 from demandops.cli import main
-from demandops.cli.queries.log import OPERATIONS
+from demandops.cli.queries.commits import OPERATIONS
 from demandops.model.demand.demand import Operation
 
 PRINT_THIRD_PARTY = """
@@ -96,7 +96,8 @@ def parse(command: click.Command, words: list[str], parent: click.Context | None
     [
         (["serve"], "rclpy", ("demandops_ros.", "rclpy."), "see README.md, 'With ROS 2'"),
         (["diff", "a", "b"], "difflib",
-         ("demandops.cli.queries.diff", "demandops.decide.changeset"), "install demandops again"),
+         ("demandops.cli.queries.commits", "demandops.decide.changeset"),
+         "install demandops again"),
     ],
 )  # fmt: skip
 def test_a_command_whose_package_is_missing_says_so(

@@ -12,7 +12,7 @@ import click
 from demandops.base.quoting import lines, one_line
 from demandops.cli.formats import output_formats, print_json
 from demandops.cli.output import busy, console, errors
-from demandops.cli.queries.diff import entry_lines, release_lines
+from demandops.cli.queries.commits import entry_lines, release_lines
 from demandops.decide.bookkeeping import EntryChange
 from demandops.decide.changeset import CHANGE_ORDER, FileChange
 from demandops.repo.merge_check import merge_check

@@ -24,7 +24,7 @@ from demandops.cli.changes.person_change import (
 )
 from demandops.cli.formats import show
 from demandops.cli.output import busy, done, errors, fitted, progress, terminal_width
-from demandops.cli.queries.diff import resolved
+from demandops.cli.queries.commits import resolved
 from demandops.cli.target import name_options, names_of
 from demandops.decide.decision import decide
 from demandops.decide.state import State

@@ -26,7 +26,7 @@ from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import formats, target
 from demandops.cli.output import done, errors, fitted, progress, terminal_width
-from demandops.cli.queries.diff import differences, entry_lines, release_lines
+from demandops.cli.queries.commits import differences, entry_lines, release_lines
 from demandops.decide.changeset import (
     FileChange,
     ReleaseChange,

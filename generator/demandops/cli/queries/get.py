@@ -19,7 +19,7 @@ from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import formats
 from demandops.cli.formats import Table, list_table
 from demandops.cli.output import at_option, errors, warn_of_not_rendered
-from demandops.cli.queries.diff import loaded
+from demandops.cli.queries.commits import loaded
 from demandops.cli.queries.status import ask_clusters
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.cluster import clusters_file

@@ -25,7 +25,7 @@ from demandops.cli.output import (
     read_by,
     warn_of_not_rendered,
 )
-from demandops.cli.queries.log import log_table
+from demandops.cli.queries.commits import log_table
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
 from demandops.cluster.clusters_file import ClusterAccess

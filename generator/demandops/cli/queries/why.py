@@ -11,7 +11,7 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.base.runtime import REAL
 from demandops.cli.formats import output_formats, output_option, show
 from demandops.cli.output import at_option, busy, fitted, terminal_width
-from demandops.cli.queries.diff import loaded
+from demandops.cli.queries.commits import loaded
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.decide.admission.may import may_demand
 from demandops.model.config.base_model import duration_text
