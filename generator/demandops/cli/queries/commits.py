@@ -14,7 +14,7 @@ from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestio
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli.formats import Table, list_table, output_formats, output_option, show, table_of
-from demandops.cli.output import SIGNS, at_option, busy, errors, progress, warn_of_problems
+from demandops.cli.output import SIGNS, at_option, busy, errors, progress
 from demandops.cli.target import name_options, state_repo_option
 from demandops.decide.bookkeeping import EntryChange, as_data, bookkeeping_changes
 from demandops.decide.bookkeeping import bookkeeping as derive
@@ -155,8 +155,19 @@ def loaded(repo: Reader, revision: str | None) -> Snapshot:
     commit = resolved(repo, revision)
     with progress("reading the ledger") as report:
         snapshot = repo.snapshot(commit, report)
-    warn_of_problems(repo, snapshot)
+    for problem in repo.problems_of(snapshot):
+        errors.print(f"warning: not in effect: {problem}")
+    if snapshot.faults:
+        errors.print(f"warning: {in_effect(repo, snapshot)}")
     return snapshot
+
+
+def in_effect(repo: Reader, snapshot: Snapshot) -> str:
+    """Tell which configuration is in effect instead of the newest, and how to change that."""
+    return (
+        f"the configuration of commit {str(snapshot.configuration)[:10]} stays in effect until a "
+        f"commit is valid; {repo.how_to_mend(snapshot)}"
+    )
 
 
 def release_lines(releases: Iterable[ReleaseChange], word: str = "") -> Iterator[str]:

@@ -16,16 +16,8 @@ import click
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.runtime import REAL
 from demandops.cli.formats import Table, list_table, output_option, show
-from demandops.cli.output import (
-    busy,
-    errors,
-    in_effect,
-    painted,
-    progress,
-    read_by,
-    warn_of_not_rendered,
-)
-from demandops.cli.queries.commits import log_table
+from demandops.cli.output import busy, errors, painted, progress, read_by, warn_of_not_rendered
+from demandops.cli.queries.commits import in_effect, log_table
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
 from demandops.cluster.clusters_file import ClusterAccess
