@@ -227,8 +227,10 @@ def _create(
         # a name in git may have characters that an owner may not have
         person = repo.operator()
         owner = person.email if id_problem(person.name) else person.name
-        given = {"reason": options.reason, "owner": owner, **fields, "select": [chosen]}
-        text = override_text(name, given)
+        given = {"reason": options.reason, "owner": owner} | {
+            field: value for field, value in fields.items() if value is not None
+        }
+        text = override_text(name, {**given, "select": [chosen]})
         parsed = Override.from_file(name, parse_file(OverrideFile, text, _path_of(name)))
         note = "  refuses what is new; what runs may be renewed, reduced and released"
         more = {"override": override_data(parsed)}, [note] if parsed.refuseNew else []
