@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 import rclpy
@@ -130,11 +131,13 @@ def _code(outcome: Receipt | BaseException) -> str:
 # The length of the queues for goals, results, cancels and feedback. ROS's default of 10 is too
 # small for a burst, because a client's queue also gets the answers to other clients.
 DEEP_QOS = QoSProfile(depth=2000)
+DEEP_SERVICES = {
+    f"{service}_service_qos_profile": DEEP_QOS for service in ("goal", "result", "cancel")
+}
 
 # How long to wait for the node's response to a goal before the goal is sent again. A node normally
 # responds within milliseconds.
 _UNHEARD_S = 5.0
-
 
 _GOAL_KEPT_S = 10  # how long ROS keeps a goal that has ended
 _RESULT_S = 900  # how long LastingResults keeps a result that ROS has forgotten
@@ -183,9 +186,7 @@ class GoalSender:
             self._node,
             action,
             action_name,
-            goal_service_qos_profile=DEEP_QOS,
-            result_service_qos_profile=DEEP_QOS,
-            cancel_service_qos_profile=DEEP_QOS,
+            **DEEP_SERVICES,
             feedback_sub_qos_profile=DEEP_QOS,
         )
         self._thread = ExecutorThread(self._node, "client")
@@ -222,14 +223,31 @@ class GoalSender:
             except DemandError:
                 continue
             self._is_discovered = True
+
+        # The goal is sent in the thread that also receives: rclpy 9.1 registers two futures for a
+        # goal, one after the other, and returns the second. If another thread sent the goal, a
+        # response could arrive between the two, and would resolve only the first, for which nobody
+        # waits.
+        def send(sent: Future[Any]) -> None:
+            try:
+                sent.set_result(
+                    self._client.send_goal_async(
+                        goal, feedback_callback=lambda message: on_feedback(message.feedback)
+                    )
+                )
+            except Exception as error:  # the caller must get it, not the executor
+                sent.set_exception(error)
+
         # A response is lost also if a new node replaced the old one and has not yet discovered this
         # client. Sending the goal again is harmless: a demand that is put twice counts once, and a
         # second release finds nothing to release.
         lost = False
         while True:
             try:
-                sent = self._start_sending(goal, on_feedback, deadline)
-                handle = self._await(sent, min(deadline, REAL.monotonic() + _UNHEARD_S))
+                sent: Future[Any] = Future()
+                self._thread.call(partial(send, sent))
+                response = self._await(sent, deadline)
+                handle = self._await(response, min(deadline, REAL.monotonic() + _UNHEARD_S))
                 break
             except DemandError:
                 if REAL.monotonic() >= deadline:
@@ -240,30 +258,6 @@ class GoalSender:
             raise DemandError("rejected", message)
         answer = self._await(handle.get_result_async(), deadline)
         return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
-
-    def _start_sending(
-        self,
-        goal: Any,  # noqa: ANN401
-        on_feedback: Callable[[Any], None],
-        deadline: float,
-    ) -> Any:  # noqa: ANN401 - a future of rclpy
-        # In the thread that also receives: rclpy 9.1 registers two futures for a goal, one after
-        # the other, and returns the second. If another thread sent the goal, a response could
-        # arrive between the two, and would resolve only the first, for which nobody waits.
-        sent: Future[Any] = Future()
-
-        def send() -> None:
-            try:
-                sent.set_result(
-                    self._client.send_goal_async(
-                        goal, feedback_callback=lambda message: on_feedback(message.feedback)
-                    )
-                )
-            except Exception as error:  # the caller must get it, not the executor
-                sent.set_exception(error)
-
-        self._thread.call(send)
-        return self._await(sent, deadline)
 
     def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
         done = REAL.event()

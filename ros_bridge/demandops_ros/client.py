@@ -237,15 +237,12 @@ class HeldDemand:
         while not self._over.wait(pause):
             pause = lease_s * _RENEW_AFTER
             try:
-                self._renew()
+                try:
+                    self._client.renew(self.id)
+                except DemandError as problem:
+                    if problem.code != "not-held":
+                        raise
+                    self._put_and_remember()  # the lease ended while the network was down
             except DemandError as problem:
                 log.warning("demand %s was not renewed: %s", self.id, problem)
                 pause = min(pause, _RETRY_S)
-
-    def _renew(self) -> None:
-        try:
-            self._client.renew(self.id)
-        except DemandError as problem:
-            if problem.code != "not-held":
-                raise
-            self._put_and_remember()  # the lease ended while the network was down

@@ -12,7 +12,7 @@ from demandops.base.errors import DemandOpsError, InvalidInput, fault
 from demandops.base.quoting import one_line
 from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
 
-from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
+from demandops_ros.client import DemandClient, DemandError, HeldDemand
 from demandops_ros.node_parameters import ros_name
 from demandops_ros.ros_process import StopSignals
 
@@ -52,27 +52,26 @@ def sent(
                 if hold:
                     held = stack.enter_context(HeldDemand(client, str(goal.get("demand")), put))
                     assert held.answer is not None  # noqa: S101 - it was put
-                    answers.append(_data(held.answer))
+                    answer = held.answer
                 else:
-                    answers.append(_data(put()))
+                    answer = put()
+                answers.append(
+                    {
+                        "outcome": answer.outcome,
+                        "commit": answer.commit or None,
+                        "reached": answer.reached,
+                        "lease": answer.lease_s or None,
+                        "warnings": list(answer.warnings),
+                    }
+                )
             except DemandError as error:
                 lines = str(error).splitlines() or [error.code]
                 answers.append(InvalidInput(fault("", line, code=error.code) for line in lines))
             except (ValueError, TypeError, AssertionError, AttributeError, OverflowError) as error:
                 answers.append(InvalidInput.at("", f"is not a demand: {error}"))
         yield answers
-        if hold and all(isinstance(answer, dict) for answer in answers):
+        if hold and all(isinstance(each, dict) for each in answers):
             tell("held until Ctrl-C")
             signals.wait()
     if hold:
         tell("released")
-
-
-def _data(answer: Answer) -> dict[str, Any]:
-    return {
-        "outcome": answer.outcome,
-        "commit": answer.commit or None,
-        "reached": answer.reached,
-        "lease": answer.lease_s or None,
-        "warnings": list(answer.warnings),
-    }

@@ -192,9 +192,7 @@ class DemandNode(Node):  # type: ignore[misc]
                 handle_accepted_callback=self._accepted,
                 cancel_callback=self._cancel,
                 callback_group=ReentrantCallbackGroup(),  # goals arrive while others are journaled
-                goal_service_qos_profile=actions.DEEP_QOS,
-                result_service_qos_profile=actions.DEEP_QOS,
-                cancel_service_qos_profile=actions.DEEP_QOS,
+                **actions.DEEP_SERVICES,
                 feedback_pub_qos_profile=actions.DEEP_QOS,
             )
         except ValueError as error:  # such as remapping rules that give both actions one name

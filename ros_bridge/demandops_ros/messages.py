@@ -91,17 +91,11 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
             {
                 **_fields(item, _CONNECTION, {"type", "topics"}, "a connection"),
                 "type": _number(_TYPES[:-1], item.get("type", "auto"), "type"),
-                "topics": [
-                    _fields(route, _ROUTE, set(), "a topic of a connection")
-                    for route in item.get("topics", ())
-                ],
+                "topics": _items(item, "topics", _ROUTE, "a topic of a connection"),
             }
             for item in data.get("connections", ())
         ],
-        "positions": [
-            _fields(position, _POSITION, set(), "a position")
-            for position in data.get("positions", ())
-        ],
+        "positions": _items(data, "positions", _POSITION, "a position"),
     }
     return fill_message(DemandMessage.Goal(), fields)
 
@@ -137,10 +131,7 @@ def _application_fields(data: Mapping[str, Any]) -> dict[str, Any]:
         **_fields(data.get("place", {}), _PLACE, set(), "a place"),
         **_fields(connect, {"broker": "connect_broker"}, {"type"}, "connect"),
         "services": [f"{name}={node}" for name, node in data.get("services", {}).items()],
-        "deliver": [
-            _fields(delivery, _DELIVERY, set(), "a delivery")
-            for delivery in data.get("deliver", ())
-        ],
+        "deliver": _items(data, "deliver", _DELIVERY, "a delivery"),
         "inputs": [
             {"role": role, **_fields(topic, _INPUT, set(), "an input")}
             for role, topics in data.get("inputs", {}).items()
@@ -163,6 +154,12 @@ def _fields(
         if name not in allowed:
             raise ValueError(f"'{name}' is not a field of {what}{suggestion(name, allowed)}")
     return {field: data[name] for name, field in names.items() if name in data}
+
+
+def _items(
+    data: Mapping[str, Any], key: str, names: Mapping[str, str], what: str
+) -> list[dict[str, Any]]:
+    return [_fields(item, names, set(), what) for item in data.get(key, ())]
 
 
 def _number(words: tuple[str, ...], word: str, field: str) -> int:

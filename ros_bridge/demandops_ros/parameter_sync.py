@@ -11,7 +11,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import DemandOpsError, InvalidInput, fault
 from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
-from demandops.cluster.config_map_watch import ConfigMapWatch
+from demandops.cluster.watches import ConfigMapWatch
 from rcl_interfaces.srv import SetParameters
 from rclpy.logging import get_logger
 from rclpy.node import Node

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from demandops.detect import rule_file
-from demandops.detect.event_engine import EventEngine
-from demandops.detect.observations import Observation
+from demandops.detect.event_engine import EventEngine, Observation
 
 from tests.kit.detection import POSE, rule, text_of
 

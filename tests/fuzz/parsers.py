@@ -25,7 +25,7 @@ from demandops.cluster.health import Target as ReleaseTarget
 from demandops.decide.state import try_configuration
 from demandops.detect import rule_file
 from demandops.detect.detector import Detector, Want
-from demandops.detect.observations import MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import MessageReader, Observation, Unreadable
 from demandops.model.config import base_model, override
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.load import load
@@ -33,7 +33,7 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.repo.forge import ForgeError, Gitea, GitHub
 from demandops.repo.git import remote_repository as addresses
-from demandops.repo.history import commit_log, commit_message, revisions
+from demandops.repo.history import commit_log, commit_message
 from demandops.serve import journal
 from demandops.serve.http_server import PushWebhook
 from demandops_interfaces.action import Demand
@@ -314,8 +314,8 @@ def address(data: bytes) -> None:
 
 def revision(data: bytes) -> None:
     repo = _repo()
-    revisions.resolve(repo, repo.head.target, _text(data), NOW)
-    revisions.parse_time(_text(data), NOW)
+    commit_log.resolve(repo, repo.head.target, _text(data), NOW)
+    commit_log.parse_time(_text(data), NOW)
 
 
 def moment(data: bytes) -> None:

@@ -30,7 +30,7 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.write.proposal_branch import branch_name
-from demandops.serve.approvals import proposal
+from demandops.serve import proposal
 from hypothesis import strategies as st
 
 from tests.fuzz import Target

@@ -18,7 +18,7 @@ from demandops.cli.main import cli
 from demandops.decide.state import rendered_files
 from demandops.detect import rule_file
 from demandops.detect.detector import Detector
-from demandops.detect.observations import Observation
+from demandops.detect.event_engine import Observation
 from demandops.model.demand.demand import Demand
 from demandops.repo import new_repo
 from demandops.repo.history import commit_message

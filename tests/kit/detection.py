@@ -6,8 +6,7 @@ from typing import Any
 
 from demandops.base import strict_yaml
 from demandops.detect import rule_file
-from demandops.detect.event_engine import EventEngine
-from demandops.detect.observations import Event, Observation, State
+from demandops.detect.event_engine import Event, EventEngine, Observation, State
 from demandops.detect.rule_file import RuleFile
 
 POSE = "geometry_msgs/msg/PoseStamped"

@@ -34,7 +34,7 @@ from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.proposal_branch import ProposalBranches
 from demandops.serve import agenda, journal
 from demandops.serve.agenda import Agenda
-from demandops.serve.approvals.approvals import Approvals
+from demandops.serve.approvals import Approvals
 from demandops.serve.demands import Demands
 from demandops.serve.journal import Receipt, Ticket
 from demandops.serve.worker import Worker

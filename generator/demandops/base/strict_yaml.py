@@ -109,11 +109,7 @@ class Loader(_CLoader):  # type: ignore[misc]
                     raise _problem("another document starts here; only one is allowed", event)
                 yield self._value(self.get_event(), 1)
 
-    def get_single_data(self) -> Any:  # noqa: ANN401 - for yaml.load
-        documents = [*self.documents(1)]
-        return documents[0] if documents else None
-
-    def _value(self, event: Any, depth: int) -> Any:  # noqa: ANN401
+    def _value(self, event: Any, depth: int) -> Any:  # noqa: ANN401, PLR0912
         kind = type(event)
         if kind is yaml.AliasEvent or event.anchor:
             # a few lines of aliases of aliases would grow to more than the memory holds
@@ -141,22 +137,18 @@ class Loader(_CLoader):  # type: ignore[misc]
             return items
         mapping: dict[str, Any] = {}
         while type(event := self.get_event()) is not yaml.MappingEndEvent:
-            key = self._key(event, depth + 1)
+            key = self._value(event, depth + 1)
+            if isinstance(key, bool) and event.value in "yYnN":
+                key = event.value  # a coordinate, rather than yes or no
+            if not isinstance(key, str):  # Helm reads the key `on` as true
+                shown = getattr(event, "value", "") or short_repr(key)
+                raise _problem(f"the key {shown} must be text; put it in quotes", event)
+            if key == "<<" and event.implicit[0]:
+                raise _problem("'<<' is not allowed; write the fields out", event)
             if key in mapping:  # parsers differ in which of the two counts
                 raise _problem(f"the key {key!r} appears twice; remove one", event)
             mapping[key] = self._value(self.get_event(), depth + 1)
         return mapping
-
-    def _key(self, event: Any, depth: int) -> str:  # noqa: ANN401
-        key = self._value(event, depth)
-        if isinstance(key, bool) and event.value in "yYnN":
-            key = event.value  # a coordinate, rather than yes or no
-        if not isinstance(key, str):  # Helm reads the key `on` as true
-            shown = getattr(event, "value", "") or short_repr(key)
-            raise _problem(f"the key {shown} must be text; put it in quotes", event)
-        if key == "<<" and event.implicit[0]:
-            raise _problem("'<<' is not allowed; write the fields out", event)
-        return key
 
 
 def short_repr(value: object) -> str:
@@ -330,18 +322,14 @@ def to_json(value: object) -> str:
     return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
-def not_writable(value: object) -> str:
+def _unknown(value: object) -> object:
     kind = getattr(type(value), "__name__", "object")
     if callable(value):
         kind += "; add '()' to call it"
-    return (
+    raise TypeError(
         "a template may write text, numbers, true, false, null, lists and mappings, but not a "
         f"{kind}"
     )
-
-
-def _unknown(value: object) -> object:
-    raise TypeError(not_writable(value))
 
 
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=_unknown)

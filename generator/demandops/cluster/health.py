@@ -33,9 +33,8 @@ class ClusterDomain:
     cluster: str
     name: str
     namespace: str
-    application: ObjectSelector | None = (
-        None  # the Argo CD Application that applies the domain's folder
-    )
+    # the Argo CD Application that applies the domain's folder
+    application: ObjectSelector | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +109,8 @@ class HealthReader(ABC):
         if not target.wanted:  # then it is healthy if it is gone
             if item is None and not (target.is_service and self._deployments(target, objects)):
                 return Health("healthy")
-            message = self._why_not_removed(item or {}) if target.is_service else ""
+            # Argo CD says in a condition why it fails to remove a service, and Flux does not
+            message = _error(item or {}) if target.is_service else ""
             reason = f"is still being removed; {message}" if message else "is still being removed"
             return Health("reconciled", reason, name_of(key), failing=bool(message))
         if item is None:
@@ -149,10 +149,6 @@ class HealthReader(ABC):
 
     @abstractmethod
     def _owns(self, target: Target, deployment: Object) -> bool: ...
-
-    def _why_not_removed(self, item: Object) -> str:
-        """Return why the controller fails to remove a service; empty if no failure is known."""
-        return ""
 
     def _deployments(self, target: Target, objects: Objects) -> list[Object]:
         return [
@@ -260,7 +256,8 @@ class Flux(HealthReader):
         return (labels.get(_APPLIED_IN), labels.get(_APPLIED_BY)) == self.follower(domain)[1:]
 
     def handled_request(self, domain: ClusterDomain, objects: Objects) -> str:
-        return _handled(self._source(domain, objects) or {})
+        status = (self._source(domain, objects) or {}).get("status") or {}
+        return str(status.get("lastHandledReconcileAt", ""))
 
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
         # whether Flux has finished all work of a domain's last fetch; ``before`` is what
@@ -272,7 +269,7 @@ class Flux(HealthReader):
         if any((item.get("spec") or {}).get("suspend") for item in (kustomization, source)):
             return True
         asked = (source["metadata"].get("annotations") or {}).get(REQUESTED_AT, "")
-        handled = _handled(source)
+        handled = self.handled_request(domain, objects)
         if handled == before or handled != asked:
             return False
         status = kustomization.get("status") or {}
@@ -310,10 +307,6 @@ def _source_name(kustomization: Object) -> str:
 def _commit(revision: object) -> str:
     # Flux writes a revision as main@sha1:…
     return str(revision or "").rpartition(":")[2]
-
-
-def _handled(source: Object) -> str:
-    return str((source.get("status") or {}).get("lastHandledReconcileAt", ""))
 
 
 # ---- Argo CD ----
@@ -399,9 +392,6 @@ class ArgoCd(HealthReader):
         tracked = f"{target.domain.namespace}_{target.name}:"
         return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
 
-    def _why_not_removed(self, item: Object) -> str:
-        return _error(item)
-
 
 def _applied_commits(app: Object) -> list[str]:
     """Return the commits that an Application is known to have applied, the newest first."""
@@ -415,10 +405,9 @@ def _applied_commits(app: Object) -> list[str]:
     # If commits come fast, an Application may never be Synced, so the commit of its last successful
     # sync counts too, unless that was only for some resources.
     result = operation.get("syncResult") or {}
-    whole = operation.get("phase") == "Succeeded" and not _requested_sync(operation).get(
-        "resources"
-    )
-    if whole and _same(result.get("source"), source):
+    is_partial = bool(_requested_sync(operation).get("resources"))
+    succeeded = operation.get("phase") == "Succeeded" and not is_partial
+    if succeeded and _same(result.get("source"), source):
         revisions.append(str(result.get("revision", "")))
     return [revision for revision in revisions if revision]
 
@@ -461,15 +450,12 @@ def _failure(app: Object) -> tuple[str, str]:
 
 def _sync_message(operation: Object) -> str:
     message = str(operation.get("message", ""))
-    failed = [
-        item
-        for item in (operation.get("syncResult") or {}).get("resources") or ()
-        if item.get("status") in ("SyncFailed", "PruneSkipped") and item.get("message")
-    ]
     details = [
         f"{item.get('kind')} {item.get('name')}: {item['message']}"
-        for item in failed
-        if str(item["message"]) not in message
+        for item in (operation.get("syncResult") or {}).get("resources") or ()
+        if item.get("status") in ("SyncFailed", "PruneSkipped")
+        and item.get("message")
+        and str(item["message"]) not in message
     ]
     return "; ".join([message, *details[:_DETAILS]])
 

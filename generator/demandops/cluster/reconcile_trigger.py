@@ -20,7 +20,7 @@ from demandops.base.runtime import REAL, Runtime
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import REQUESTED_AT, ClusterDomain, Flux, ObjectSelector
-from demandops.cluster.object_cache import object_caches
+from demandops.cluster.watches import object_caches
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain
 from demandops.render.gitops import domain_folder, domains_in_use, project_of

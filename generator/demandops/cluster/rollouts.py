@@ -1,13 +1,14 @@
-"""Follows what a demand needs or removes until it runs, or is gone."""
+"""What the clusters report of releases: the state of each now, and as it changes until it runs."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
+from typing import Literal
 
 from demandops.base.errors import Refused
 from demandops.base.runtime import REAL, Runtime
@@ -20,10 +21,11 @@ from demandops.cluster.health import (
     ObjectSelector,
     Target,
     health_reader,
+    name_of,
     why_unavailable,
     worst,
 )
-from demandops.cluster.object_cache import object_caches
+from demandops.cluster.watches import ObjectCache, object_caches
 from demandops.decide.decision import Decision
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import plan
@@ -34,9 +36,11 @@ from demandops.model.config.repo_settings import RepoSettings
 from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import World
 from demandops.model.release import Release, ServiceRelease
-from demandops.render.gitops import domains_in_use, project_of
+from demandops.render.gitops import bootstrap_path, digest_in, digest_of, domains_in_use, project_of
 
-# ---- the targets whose rollout can be followed ----
+log = logging.getLogger("demandops")
+
+# ---- the targets: what a release is on its cluster ----
 
 
 def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:
@@ -80,12 +84,169 @@ def target_of(release: Release, repository: RepoSettings, *, wanted: bool = True
     return Target(domain, release.name, isinstance(release, ServiceRelease), wanted)
 
 
+# ---- bootstrap files that are older on a cluster than in the state repo ----
+
+
+@dataclass(frozen=True, slots=True)
+class OldBootstrap:
+    cluster: str
+    file: str
+    domains: tuple[str, ...]  # whose objects are old or missing
+    command: str
+
+    def __str__(self) -> str:
+        return (
+            f"cluster '{self.cluster}' does not have the current {self.file} (access domains: "
+            f"{', '.join(self.domains)}); an administrator of the cluster must apply it: "
+            f"{self.command}"
+        )
+
+
+def old_bootstraps(
+    domains: Collection[ClusterDomain],
+    caches: Mapping[str, ObjectCache],
+    read: Callable[[str], str | None],
+) -> list[OldBootstrap]:
+    clusters = []
+    for cluster in sorted({domain.cluster for domain in domains} & caches.keys()):
+        path = bootstrap_path(cluster)
+        digest = digest_in(read(path) or "")
+        store, objects = caches[cluster], caches[cluster].objects()
+        old = tuple(
+            domain.name
+            for domain in domains
+            if domain.cluster == cluster
+            and store.unknown_health(domain) is None
+            and digest_of(objects.get(health_reader(domain).follower(domain)) or {}) != digest
+        )
+        if digest and old:
+            command = f"git show main:{path} | kubectl apply -f -"
+            clusters.append(OldBootstrap(cluster, path, old, command))
+    return clusters
+
+
+# ---- objects that a GitOps controller created and forgot, so that it never removes them ----
+
+
+@dataclass(frozen=True, slots=True)
+class Orphan:
+    cluster: str
+    kind: str
+    namespace: str
+    name: str
+
+    @property
+    def object(self) -> str:
+        return name_of((self.kind, self.namespace, self.name))
+
+    @property
+    def command(self) -> str:
+        """The command that deletes the object and, for a connection end, also its ConfigMap."""
+        names = [f"{self.kind.lower()}/{self.name}"]
+        names += [f"configmap/{self.name}"] if self.kind == "Deployment" else []
+        return f"kubectl -n {self.namespace} delete --ignore-not-found {' '.join(names)}"
+
+    def __str__(self) -> str:
+        return (
+            f"{self.object} on cluster '{self.cluster}' belongs to no release any more; an "
+            f"administrator of the cluster must delete it: {self.command}"
+        )
+
+
+def orphans(
+    domains: Collection[ClusterDomain],
+    targets: Iterable[Target],
+    commit: str,
+    caches: Mapping[str, ObjectCache],
+    history: History,
+) -> Iterator[Orphan]:
+    needed = {(target.domain, health_reader(target.domain).key(target)) for target in targets}
+    for domain in sorted(domains, key=lambda domain: (domain.cluster, domain.name)):
+        store = caches.get(domain.cluster)
+        if store is None or store.unknown_health(domain):
+            continue
+        reader, objects = health_reader(domain), store.objects()
+        # a controller that has not applied the newest commit may still remove objects
+        if not reader.domain_health(domain, commit, objects, history).reaches("reconciled"):
+            continue
+        for key, item in sorted(objects.items()):
+            kind, namespace, name = key
+            if (
+                namespace == domain.namespace
+                and kind in (reader.service_kind, "Deployment")
+                and (domain, key) not in needed
+                and not item["metadata"].get("deletionTimestamp")
+                and reader.applied_by(domain, item)
+            ):
+                yield Orphan(domain.cluster, kind, namespace, name)
+
+
+# ---- the status of releases, for the command line and the page ----
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseStatus:
+    health: Health
+    seen: str = ""  # the commit that the release's access domain has applied, if that is known
+    since: str = ""  # when the state last changed, if that is known
+
+    @property
+    def state(self) -> Literal["waiting", "reconciled", "healthy", "unknown"]:
+        # of a cluster that cannot be read, the state is `waiting`, and the reason says so
+        return self.health.state if self.seen or self.health.object else "unknown"
+
+
+_NO_ACCESS = ReleaseStatus(Health("waiting"))
+# Returns the paths in which two commits differ, if that is known.
+ChangedPaths = Callable[[str, str], "Collection[str] | None"]
+
+
+def statuses(
+    targets: Iterable[Target],
+    commit: str,
+    caches: Mapping[str, ObjectCache],
+    history: History,
+    changed: ChangedPaths = lambda seen, commit: None,
+) -> list[ReleaseStatus]:
+    changed = cache(changed)
+    history = _CachedHistory(history)
+    objects = {name: store.objects() for name, store in caches.items()}
+    unread: dict[ClusterDomain, Health | None] = {}
+    results = []
+    for target in targets:
+        domain = target.domain
+        if (store := caches.get(domain.cluster)) is None:
+            results.append(_NO_ACCESS)
+            continue
+        if domain not in unread:
+            unread[domain] = store.unknown_health(domain)
+        if reason := unread[domain]:
+            results.append(ReleaseStatus(reason))
+            continue
+        reader, there = health_reader(domain), objects[domain.cluster]
+        health = reader.health(target, commit, there, history)
+        seen = reader.applied_commit(domain, there)
+        # A new commit must not hide the health of the releases that it does not change. So they
+        # count as applied while the controller still works on the commit.
+        if health.state == "waiting" and not health.failing and seen:
+            paths, end = changed(seen, commit), f"/{target.name}.yaml"
+            if paths is not None and not any(path.endswith(end) for path in paths):
+                health = reader.release_health(target, seen, there, history)
+        results.append(ReleaseStatus(health, seen, reader.last_transition(target, there)))
+    return results
+
+
+class _CachedHistory:
+    # all releases of a domain ask the same questions, and each answer reads commits
+    def __init__(self, history: History) -> None:
+        self.includes = cache(history.includes)
+        self.unchanged = cache(history.unchanged)
+
+
 # ---- following until a release is reconciled or healthy, as requested ----
 #
 # One thread evaluates the rollouts whenever a watch reports a change. An unreachable cluster delays
 # only its own rollouts.
-
-log = logging.getLogger("demandops")
 
 # Called with a state (reconciled, healthy, failing) and a text, once for each text.
 OnProgress = Callable[[str, str], None]
@@ -148,8 +309,8 @@ class RolloutWatcher:
         self._closed = True
         self._changed.set()
         self._thread.join(5)
-        for cache in self._caches.values():
-            cache.close()
+        for store in self._caches.values():
+            store.close()
 
     def _run(self) -> None:
         while not self._closed:
@@ -164,7 +325,7 @@ class RolloutWatcher:
             rollouts = list(self._open)
         if not rollouts:
             return
-        objects = {name: cache.objects() for name, cache in self._caches.items()}
+        objects = {name: store.objects() for name, store in self._caches.items()}
         for rollout in rollouts:
             if rollout.busy and not last:
                 continue
@@ -231,8 +392,8 @@ class RolloutWatcher:
             with suppress(Exception):
                 for domain in rollout.domains:
                     if domain.namespace == namespace:
-                        cache = self._caches[domain.cluster]
-                        if reason := why_unavailable(cache.pods(namespace, deployment)):
+                        pods = self._caches[domain.cluster].pods(namespace, deployment)
+                        if reason := why_unavailable(pods):
                             health = replace(health, reason=f"{health.reason}; {reason}")
                             break
         self._resolve(rollout, health)

@@ -26,7 +26,6 @@ def type_numbered(number: int) -> ConnectionType | None:
 
 
 def type_named(word: str) -> ConnectionType:
-    """Return the type that files call ``word``; raise ``KeyError`` if there is none."""
     return {kind.word: kind for kind in CONNECTION_TYPES}[word]
 
 

@@ -60,10 +60,6 @@ Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 Metres = Annotated[float, Field(ge=0, le=1e6)]
 
 
-# x and y in metres, in the map frame of the positions.
-Point = tuple[float, float]
-
-
 class _InArea(CamelModel):
     """A condition on the distance to a point or a polygon."""
 
@@ -78,8 +74,8 @@ class _InArea(CamelModel):
         return self
 
     @cached_property
-    def corners(self) -> tuple[Point, ...]:
-        # one, or at least three; an edge joins the last and the first
+    def corners(self) -> tuple[tuple[float, float], ...]:
+        # in metres, in the map frame; one, or at least three: an edge joins the last and the first
         corners = self.polygon or ((self.point,) if self.point else ())
         return tuple((corner.x, corner.y) for corner in corners)
 

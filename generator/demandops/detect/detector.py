@@ -8,8 +8,7 @@ from heapq import heappop, heappush
 from math import inf
 from typing import Any, Literal
 
-from demandops.detect.event_engine import EventEngine
-from demandops.detect.observations import Event, Key, Observation
+from demandops.detect.event_engine import Event, EventEngine, Key, Observation
 from demandops.detect.rule_file import BookedDemand, Goal, RuleFile, Values
 from demandops.model.config.base_model import seconds_of
 
@@ -30,7 +29,7 @@ def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, G
             values = rule.template.subjects_of(demand, rule.subjects, rule.name)
             if values is not None:
                 subjects = tuple(str(values[name]) for name in rule.subjects)
-                if rule.is_for(*subjects):
+                if rule.is_for(subjects):
                     goal = rule.template.outline({"rule": rule.name, **values})
                     goals[rule.name, subjects] = goal
                     break
@@ -59,7 +58,6 @@ class Want:
 class Detector:
     def __init__(self, file: RuleFile, now: float) -> None:
         self.file = file
-        self._rules = {rule.name: rule for rule in file.rules}
         self._engine = EventEngine(file)
         self._state = self._engine.start(now)
         self._values: dict[Key, Values] = {}
@@ -89,7 +87,7 @@ class Detector:
             goal = None
             if event.starts:
                 self._values[event.key] = event.values
-                goal = self._rules[event.rule].template.filled(event.values)
+                goal = self._engine.rules[event.rule].template.filled(event.values)
             else:
                 self._values.pop(event.key, None)
             wants.append((event, self._want(event.key, goal)))
@@ -106,9 +104,8 @@ class Detector:
         the event wants the goal of the changed rule. Dwell times begin anew. As in :meth:`resume`,
         the entities of lasting events count as gone if unseen for ``settle_s``.
         """
-        before, old = self._state.lasting, self._rules
+        before, old = self._state.lasting, self._engine.rules
         self.file, self._engine = file, EventEngine(file)
-        self._rules = {rule.name: rule for rule in file.rules}
         self._state = self._engine.start(now, sorted(before), settle_s)
         changed = []
         for key in sorted(before):
@@ -116,8 +113,7 @@ class Detector:
             if key not in self._state.lasting:
                 self._values.pop(key, None)
                 changed.append(Want(key, None))
-            elif old[name] != self._rules[name]:
-                rule = self._rules[name]
+            elif old[name] != (rule := self._engine.rules[name]):
                 entities = dict(zip(rule.subjects, subjects, strict=True))
                 values: Values = {**self._values.get(key, {}), "rule": name, **entities}
                 # After a restart, the values at the start of an event are not known, for example
@@ -127,8 +123,7 @@ class Detector:
         return changed
 
     def _want(self, key: Key, goal: Goal | None) -> Want:
-        rule = self._rules.get(key[0])
-        if rule is None:
+        if (rule := self._engine.rules.get(key[0])) is None:
             return Want(key, goal)
         renew_s = seconds_of(rule.renew) if rule.renew else 0
         return Want(key, goal, seconds_of(rule.retry), renew_s)

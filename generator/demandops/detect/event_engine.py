@@ -5,56 +5,191 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
-from fnmatch import translate
+from copy import copy
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from math import floor, hypot, inf
+from math import floor, hypot, inf, isfinite
 from statistics import median
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeAlias
 
 from demandops.detect.condition import Count, Hours, Near, Threshold, Together
-from demandops.detect.observations import Cell, Event, Key, Observation, Phase, State, Who
-from demandops.detect.rule_file import Rule, RuleFile, Values
+from demandops.detect.rule_file import Rule, RuleFile, Who, is_entity
 from demandops.model.config.base_model import seconds_of
 
-# ---- rules, as the engine applies them ----
+# ---- the engine's state between two steps: who was seen where, which events have not ended ----
 
-Seen = Mapping[Who, Observation]
+# The identity of an event: its rule, and the entities that it is about.
+Key: TypeAlias = tuple[str, tuple[str, ...]]
+
+# A square of the map, for one source of a rule on pairs: (rule, source, column, row).
+Cell: TypeAlias = tuple[str, str, int, int]
+
+_NOTHING: Mapping[Any, Any] = MappingProxyType({})
 
 
-class CompiledRule:
-    def __init__(self, rule: Rule) -> None:
-        self.name, self.subjects, self.sources = rule.name, rule.subjects, rule.sources
-        self.condition, self.dwell = rule.condition, float(seconds_of(rule.dwell))
-        # A bracket in a pattern stands for itself, but ``translate`` gives it a meaning.
-        patterns = [pattern.replace("[", "[[]") for pattern in rule.entities]
-        self._names = None if "*" in patterns else re.compile("|".join(map(translate, patterns)))
+class Observation(NamedTuple):
+    """One message about an entity; ``values`` are the fields that thresholds read."""
 
-    def takes(self, who: Who) -> bool:
-        # The patterns of a rule on pairs limit only the entities of the first source.
-        return who[0] != self.sources[0] or self._names is None or bool(self._names.match(who[1]))
+    source: str
+    entity: str
+    at: float
+    position: tuple[float, float] | None = None
+    values: Mapping[str, float] = _NOTHING
 
-    def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
-        # A rule on pairs from one source names this source once, but its events have two entities.
-        return tuple(zip((*self.sources, *self.sources), subjects, strict=False))
+    @property
+    def who(self) -> Who:
+        return self.source, self.entity
 
-    def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> tuple[Values, str]:
-        """Return an event's values for the rule's template, and its cause in words for people."""
-        values: dict[str, str | float] = {"rule": self.name}
-        values |= dict(zip(self.subjects, subjects, strict=True))
-        entities = [seen[who] for who in self.entities_of(subjects)]
-        x, y = (entities[0].position if entities else None) or (0.0, 0.0)
-        match self.condition:
-            case Threshold(field=field):
-                value = entities[0].values.get(field, 0.0)
-                return values | {"value": value}, f"{field} of {subjects[0]} is {value:g}"
-            case Count():
-                return values | {"count": count}, f"{count} entities are in or near the area"
-            case Near() as area:
-                values |= {"x": x, "y": y, "distance": (away := area.distance(x, y))}
-                return values, f"{subjects[0]} is {away:.1f} m from the area"
-            case Together():
-                values |= {"x": x, "y": y, "distance": (away := distance(*entities))}
-                return values, f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
-        return values, "the hours of the schedule"
+
+class Event(NamedTuple):
+    """A demand is wanted from now on, or no longer; ``why`` is for people."""
+
+    rule: str
+    subjects: tuple[str, ...]
+    starts: bool
+    at: float
+    why: str
+    values: Mapping[str, str | float] = _NOTHING
+
+    @property
+    def key(self) -> Key:
+        return self.rule, self.subjects
+
+
+class Phase(NamedTuple):
+    """The dwell time before an event, or the event itself if it ``lasts``."""
+
+    since: float
+    lasts: bool
+
+
+@dataclass(slots=True)
+class State:
+    """The engine's whole state; times are in seconds since 1970."""
+
+    now: float
+    # The earliest time at which anything may change without an observation.
+    due: float
+    # Before this time, a low count ends no event, because entities report one after the other after
+    # a start.
+    settled: float
+    # The time at which the schedules are checked next.
+    hours_due: float
+    # The last observation of each entity that is not gone.
+    seen: dict[Who, Observation] = field(default_factory=dict)
+    # The entities of resumed events that have not been seen since the engine started. Each has the
+    # time at which it counts as gone.
+    awaited: dict[Who, float] = field(default_factory=dict)
+    # The phases that have not ended.
+    phases: dict[Key, Phase] = field(default_factory=dict)
+    # For each entity, the keys of the phases in which the entity takes part.
+    engaged: dict[Who, frozenset[Key]] = field(default_factory=dict)
+    # For each entity, the names of the rules with a count in whose radius the entity is.
+    counted: dict[Who, frozenset[str]] = field(default_factory=dict)
+    # How many entities a rule counts, by the name of the rule.
+    counts: dict[str, int] = field(default_factory=dict)
+    # The entities in each square, for rules on pairs.
+    cells: dict[Cell, frozenset[str]] = field(default_factory=dict)
+
+    def copied(self) -> State:
+        # The values in the mappings are immutable. The copies cost little, because one step takes
+        # many observations.
+        own: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        return State(**{name: copy(value) for name, value in own.items()})
+
+    @property
+    def lasting(self) -> frozenset[Key]:
+        return frozenset(key for key, phase in self.phases.items() if phase.lasts)
+
+    def shifted(self, seconds: float) -> State:
+        """Return the state after the clock was set forward by ``seconds``."""
+        # All times move with the clock, so dwell times and timeouts go on. Only schedules follow
+        # the new time: the next step looks at them.
+        return replace(
+            self,
+            now=self.now + seconds,
+            settled=self.settled + seconds,
+            due=min(self.due, self.now) + seconds,
+            hours_due=self.now + seconds,
+            seen={who: last._replace(at=last.at + seconds) for who, last in self.seen.items()},
+            awaited={who: until + seconds for who, until in self.awaited.items()},
+            phases={
+                key: phase._replace(since=phase.since + seconds)
+                for key, phase in self.phases.items()
+            },
+        )
+
+
+# ---- reads which entity a message is about, where the entity is, and which values it reports ----
+#
+# A message may be any object with attributes, so messages of rclpy and of a recorded bag are read
+# alike.
+
+_FARTHEST_M = 1e9
+_PART = re.compile(r"(\w+)|\[(\d+)\]")
+
+Getter = Callable[[Any], Any]
+
+
+class Unreadable(Exception):
+    """Raised for a message that cannot be used; the error's text is one line."""
+
+
+class MessageReader:
+    """Reads the messages of one source, and of these only the fields that rules need."""
+
+    def __init__(self, file: RuleFile, source: str) -> None:
+        definition = file.sources[source]
+        self._source = source
+        self._entity = definition.entity and _getter(definition.entity)
+        self._position = definition.position and tuple(map(_getter, definition.position))
+        thresholds = (rule.threshold for rule in file.rules)
+        fields = {limits.field for limits in thresholds if limits and limits.source == source}
+        self._fields = {field: _getter(field) for field in sorted(fields)}
+
+    def observation(self, message: Any, entity: str, at: float) -> Observation:  # noqa: ANN401
+        """Return what a message reports; ``entity`` is from the topic, empty if a field has it."""
+        if self._entity:
+            entity = str(self._entity(message)).strip("/")
+            if not is_entity(entity):
+                raise Unreadable(f"{entity[:60]!r} is not a name of an entity")
+        position = None
+        if self._position:
+            x, y = (_number(get(message)) for get in self._position)
+            if abs(x) > _FARTHEST_M or abs(y) > _FARTHEST_M:
+                raise Unreadable(f"the position is more than {_FARTHEST_M:g} m from the origin")
+            position = x, y
+        values = {field: _number(get(message)) for field, get in self._fields.items()}
+        return Observation(self._source, entity, at, position, values)
+
+
+def _number(value: object) -> float:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise Unreadable(f"{str(value)[:60]!r} is not a number") from None
+    if not isfinite(number):
+        raise Unreadable(f"{number} is not a finite number")
+    return number
+
+
+def _getter(path: str) -> Getter:
+    parts = [(name, int(index or 0)) for name, index in _PART.findall(path)]
+
+    def get(message: Any) -> Any:  # noqa: ANN401
+        value = message
+        try:
+            for name, index in parts:
+                value = getattr(value, name) if name else value[index]
+        except (AttributeError, IndexError, TypeError):
+            raise Unreadable(f"the message has no field {path}") from None
+        return value
+
+    return get
+
+
+# ---- an index of pairs by position, so that an entity is compared only with those near it ----
 
 
 def distance(last: Observation, other: Observation) -> float:
@@ -64,10 +199,9 @@ def distance(last: Observation, other: Observation) -> float:
 
 class Pairs:
     # The map is divided into squares as wide as the distance at which the condition stops. So all
-    # partners of an entity are in the entity's square and the squares around it, and an entity is
-    # not compared with all others.
+    # partners of an entity are in the entity's square and the squares around it.
 
-    def __init__(self, rule: CompiledRule, condition: Together) -> None:
+    def __init__(self, rule: Rule, condition: Together) -> None:
         self.rule, self.condition = rule, condition
         self._first, self._second = rule.sources[0], rule.sources[-1]
 
@@ -117,15 +251,14 @@ class Pairs:
                         yield source, entity
 
 
-# ---- an index of areas by position, so that an entity is compared only with those near it ----
+# ---- an index of areas by position ----
 
 _SMALLEST_CELL_M = 10.0
 # How many squares an area in the index may touch. A larger area is compared with every entity.
 _MOST_CELLS = 4096
 
-
 # A rule, and its condition on an area
-Area = tuple[CompiledRule, Near | Count]
+Area = tuple[Rule, Near | Count]
 
 
 class AreaGrid:
@@ -167,17 +300,16 @@ class EventEngine:
     """The rules of a file, indexed by source and area; :meth:`step` applies them."""
 
     def __init__(self, file: RuleFile) -> None:
-        self.rules: dict[str, CompiledRule] = {}
+        self.rules = {rule.name: rule for rule in file.rules}
         self.timeouts = {
             name: float(seconds_of(source.timeout)) for name, source in file.sources.items()
         }
-        self.hours: list[tuple[CompiledRule, Hours]] = []
-        self.thresholds: dict[str, list[tuple[CompiledRule, Threshold]]] = defaultdict(list)
+        self.hours: list[tuple[Rule, Hours]] = []
+        self.thresholds: dict[str, list[tuple[Rule, Threshold]]] = defaultdict(list)
         self.pairs: dict[str, list[Pairs]] = defaultdict(list)
         areas = defaultdict[str, list[Area]](list)
-        for each in file.rules:
-            rule = self.rules[each.name] = CompiledRule(each)
-            match each.condition:
+        for rule in file.rules:
+            match rule.condition:
                 case Near() | Count() as area:
                     areas[area.source].append((rule, area))
                 case Together() as together:
@@ -237,12 +369,9 @@ class EngineStep:
     def resume(self, key: Key, settle_s: float) -> None:
         # An event that started before a restart; one that no rule is for is ignored.
         rule = self._engine.rules.get(key[0])
-        if rule is None or len(rule.subjects) != len(key[1]):
-            return
-        entities = rule.entities_of(key[1])
-        if all(map(rule.takes, entities)):
+        if rule is not None and len(rule.subjects) == len(key[1]) and rule.is_for(key[1]):
             self._enter(key, rule, Phase(self.state.now, lasts=True))
-            for who in entities:
+            for who in rule.entities_of(key[1]):
                 # A source that reports seldom may not have reported yet when the detector settles.
                 wait_s = max(settle_s, self._engine.timeouts[who[0]])
                 self.state.awaited[who] = self.state.now + wait_s
@@ -265,7 +394,7 @@ class EngineStep:
     def _all_due(self) -> Iterator[tuple[float, Callable[[], None]]]:
         for key, phase in self.state.phases.items():
             if not phase.lasts:
-                at = phase.since + self._engine.rules[key[0]].dwell
+                at = phase.since + self._engine.rules[key[0]].dwell_s
                 yield at, partial(self._end_dwell, key, phase)
         if self._engine.hours:
             yield self.state.hours_due, self._look_at_hours
@@ -313,7 +442,7 @@ class EngineStep:
 
     # ---- observations ----
 
-    def observe(self, observation: Observation) -> None:
+    def observe(self, observation: Observation) -> None:  # noqa: PLR0912
         if observation.at != self.state.now:
             observation = observation._replace(at=self.state.now)
         who, source, entity = observation.who, observation.source, observation.entity
@@ -326,24 +455,17 @@ class EngineStep:
             if value is not None and rule.takes(who):
                 is_past, is_back = limits.is_past(value), limits.is_back(value)
                 self._latch((rule.name, (entity,)), rule, is_past, is_back)
-        if observation.position is not None:
-            self._compare_with_areas(observation, *observation.position)
-            for pair in self._engine.pairs[source]:
-                if pair.rule.takes(who):
-                    pair.move(self.state.cells, entity, before, observation)
-                    self._compare_with_others(pair, observation)
-
-    def _compare_with_areas(self, observation: Observation, x: float, y: float) -> None:
-        who, entity = observation.who, observation.entity
+        if observation.position is None:
+            return
+        x, y = observation.position
         compared, counted = set[str](), set[str]()
-        for rule, area in self._engine.areas[observation.source].at(x, y):
+        for rule, area in self._engine.areas[source].at(x, y):
             if not rule.takes(who):
                 continue
             away = area.distance(x, y)
             if isinstance(area, Near):
                 compared.add(rule.name)
-                key: Key = (rule.name, (entity,))
-                self._latch(key, rule, away <= area.start, away > area.stop)
+                self._latch((rule.name, (entity,)), rule, away <= area.start, away > area.stop)
             elif away <= area.radius:
                 counted.add(rule.name)
         # The index does not yield the areas that the entity has left, so their events end here.
@@ -351,11 +473,15 @@ class EngineStep:
             left = self._engine.rules[key[0]]
             if isinstance(left.condition, Near) and key[0] not in compared:
                 self._latch(key, left, False, True)
-        before = self.state.counted.get(who, frozenset())
-        if counted != before:
+        counted_before = self.state.counted.get(who, frozenset())
+        if counted != counted_before:
             self.state.counted[who] = frozenset(counted)
-            for name in sorted(counted ^ before):
+            for name in sorted(counted ^ counted_before):
                 self._count(name, 1 if name in counted else -1)
+        for pairs in self._engine.pairs[source]:
+            if pairs.rule.takes(who):
+                pairs.move(self.state.cells, entity, before, observation)
+                self._compare_with_others(pairs, observation)
 
     def _compare_with_others(self, pairs: Pairs, observation: Observation) -> None:
         who, compared = observation.who, set[Key]()
@@ -380,27 +506,27 @@ class EngineStep:
 
     # ---- events ----
 
-    def _latch(self, key: Key, rule: CompiledRule, starts: bool, stops: bool) -> None:
+    def _latch(self, key: Key, rule: Rule, starts: bool, stops: bool) -> None:
         phase = self.state.phases.get(key)
         if stops and phase is not None:
             self._leave(key, rule, "")
         elif starts and phase is None:
-            if rule.dwell:
+            if rule.dwell_s:
                 self._enter(key, rule, Phase(self.state.now, lasts=False))
-                self.state.due = min(self.state.due, self.state.now + rule.dwell)
+                self.state.due = min(self.state.due, self.state.now + rule.dwell_s)
             else:
                 self._begin(key, rule)
 
-    def _begin(self, key: Key, rule: CompiledRule) -> None:
+    def _begin(self, key: Key, rule: Rule) -> None:
         self._enter(key, rule, Phase(self.state.now, lasts=True))
         self._report(key, rule, True, "")
 
-    def _enter(self, key: Key, rule: CompiledRule, phase: Phase) -> None:
+    def _enter(self, key: Key, rule: Rule, phase: Phase) -> None:
         self.state.phases[key] = phase
         for who in rule.entities_of(key[1]):
             self.state.engaged[who] = self.state.engaged.get(who, frozenset()) | {key}
 
-    def _leave(self, key: Key, rule: CompiledRule, why: str) -> None:
+    def _leave(self, key: Key, rule: Rule, why: str) -> None:
         phase = self.state.phases.pop(key)
         for who in rule.entities_of(key[1]):
             self.state.engaged[who] -= {key}
@@ -409,9 +535,28 @@ class EngineStep:
         if phase.lasts:
             self._report(key, rule, False, why)
 
-    def _report(self, key: Key, rule: CompiledRule, starts: bool, why: str) -> None:
+    def _report(self, key: Key, rule: Rule, starts: bool, why: str) -> None:
         if why:
             self.events.append(Event(*key, starts, self.state.now, why))
-        else:
-            values, cause = rule.facts(key[1], self.state.seen, self.state.counts.get(key[0], 0))
-            self.events.append(Event(*key, starts, self.state.now, cause, values))
+            return
+        subjects = key[1]
+        values: dict[str, str | float] = {"rule": rule.name}
+        values |= dict(zip(rule.subjects, subjects, strict=True))
+        entities = [self.state.seen[who] for who in rule.entities_of(subjects)]
+        x, y = (entities[0].position if entities else None) or (0.0, 0.0)
+        match rule.condition:
+            case Threshold(field=field):
+                values["value"] = value = entities[0].values.get(field, 0.0)
+                why = f"{field} of {subjects[0]} is {value:g}"
+            case Count():
+                values["count"] = count = self.state.counts.get(rule.name, 0)
+                why = f"{count} entities are in or near the area"
+            case Near() as area:
+                values |= {"x": x, "y": y, "distance": (away := area.distance(x, y))}
+                why = f"{subjects[0]} is {away:.1f} m from the area"
+            case Together():
+                values |= {"x": x, "y": y, "distance": (away := distance(*entities))}
+                why = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
+            case Hours():
+                why = "the hours of the schedule"
+        self.events.append(Event(*key, starts, self.state.now, why, values))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -253,8 +254,10 @@ def faults_of_demand(
 def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fault]:
     """Yield a fault for each id that is missing, may change, or would be that of two events."""
     data: Any = template.data
+    for name in ("demand", "requesters") if template.action == "Demand" else ("id",):
+        if not data.get(name):
+            yield fault(f"{field}.{name}", "is missing; add it")
     if template.action == "Demand":
-        yield from _missing(data, field, "demand", "requesters")
         why = "otherwise two events would share one demand"
         listed: list[tuple[str, Sequence[str]]] = [("demand", [data.get("demand", "")])]
         for name, what in (("demand", "id"), ("requesters", "requesters")):
@@ -265,7 +268,6 @@ def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fau
                     )
                     yield fault(path, f"{message}leave that name out")
     else:
-        yield from _missing(data, field, "id")
         why = "a shutdown ends what its requesters joined, so each event needs its own requesters"
         listed = [*requester_lists(template.action, data)]
     for path, values in listed:
@@ -273,12 +275,6 @@ def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fau
         if missing and any(values):
             named = " and ".join(sorted(missing))
             yield fault(f"{field}.{path}", f"must name {named}, because {why}")
-
-
-def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: ANN401 - plain data
-    for name in needed:
-        if not data.get(name):
-            yield fault(f"{field}.{name}", "is missing; add it")
 
 
 # ---- the file of rules, and the checks across its parts ----
@@ -329,6 +325,9 @@ class Source(CamelModel):
         return (self.x, self.y) if self.x and self.y else POSITIONS.get(self.type)
 
 
+# The identity of an entity: its source and its name.
+Who: TypeAlias = tuple[str, str]
+
 CONDITIONS = ("near", "together", "count", "threshold", "schedule")
 
 
@@ -373,19 +372,23 @@ class Rule(CamelModel):
             raise ValueError("retry and renew must be one second or more")
         return self
 
-    @property
+    @cached_property
     def condition(self) -> Near | Together | Count | Threshold | Hours:
         condition = self.near or self.together or self.count or self.threshold or self.schedule
         assert condition is not None  # noqa: S101 - validated above
         return condition
 
-    @property
+    @cached_property
+    def dwell_s(self) -> float:
+        return float(base_model.seconds_of(self.dwell))
+
+    @cached_property
     def sources(self) -> tuple[str, ...]:
         """The sources that the rule's condition reads: none, one, or two for ``together``."""
         named = (getattr(self.condition, name, None) for name in ("source", "other"))
         return tuple(name for name in named if name)
 
-    @property
+    @cached_property
     def subjects(self) -> tuple[str, ...]:
         """The names by which the template refers to an event's entities, such as ``entity``."""
         if self.together is not None:
@@ -405,10 +408,16 @@ class Rule(CamelModel):
             return Goal("Demand", self.demand)
         return Goal("DeploymentRequest", self.deployment_request or {})
 
-    def is_for(self, *entities: str) -> bool:
-        # The patterns of a rule for pairs from two sources limit only the entity of the first.
-        limited = entities[:1] if self.together and self.together.other else entities
-        return all(matches(entity, self.entities) for entity in limited)
+    def takes(self, who: Who) -> bool:
+        # The patterns of a rule on pairs limit only the entities of the first source.
+        return who[0] != self.sources[0] or "*" in self.entities or matches(who[1], self.entities)
+
+    def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
+        # A rule on pairs from one source names this source once, but its events have two entities.
+        return tuple(zip((*self.sources, *self.sources), subjects, strict=False))
+
+    def is_for(self, subjects: tuple[str, ...]) -> bool:
+        return all(map(self.takes, self.entities_of(subjects)))
 
 
 class RuleFile(FileModel):

@@ -88,6 +88,12 @@ def _read_folder(folder: Path, prefix: str) -> dict[str, str]:
 
 # ---- the repository with its first commit ----
 
+_WHY = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
+_FIRST_MESSAGE = commit_message.compose(
+    [["Create the state repo"], [_WHY]],
+    [("Operation", "init"), ("Render-Version", str(RENDER_VERSION))],
+)
+
 
 def init(  # noqa: PLR0913 - what a state repo begins with
     target: Path,
@@ -118,7 +124,20 @@ def init(  # noqa: PLR0913 - what a state repo begins with
         partial = target.with_name(f".{target.name}.partial")
         shutil.rmtree(partial, ignore_errors=True)
         try:
-            commit = _write(partial, content, now, bare, signer)
+            repo = pygit2.init_repository(str(partial), bare=bare, initial_head=MAIN_BRANCH)
+            repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
+            repo.config["receive.fsckObjects"] = True  # refuse objects that libgit2 cannot read
+            repo.config["gc.auto"] = 0  # because the generator joins the packs in the background
+            objects = NewObjects(repo)
+            who = commit_message.generator_signature(now)
+            commit = objects.add_commit(
+                signer, (who, who), _FIRST_MESSAGE, objects.add_tree(None, content), []
+            )
+            with objects.packed(commit):
+                repo.references.create(f"refs/heads/{MAIN_BRANCH}", commit)
+            if not bare:
+                force = pygit2.enums.CheckoutStrategy.FORCE
+                repo.checkout_head(strategy=force)  # type: ignore[no-untyped-call]
             if target.exists():  # keep the folder, because a shell may be in it
                 for part in partial.iterdir():
                     part.rename(target / part.name)
@@ -129,27 +148,4 @@ def init(  # noqa: PLR0913 - what a state repo begins with
     except (OSError, pygit2.GitError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise StateRepoError(f"{target} cannot be made: {reason}; name another folder") from None
-    return commit
-
-
-def _write(
-    folder: Path, content: Mapping[str, str], now: datetime, bare: bool, signer: Signer | None
-) -> str:
-    repo = pygit2.init_repository(str(folder), bare=bare, initial_head=MAIN_BRANCH)
-    repo.config["core.fsync"] = "committed"  # a push is on the disk when it is acknowledged
-    repo.config["receive.fsckObjects"] = True  # refuse objects that libgit2 cannot read
-    repo.config["gc.auto"] = 0  # because the generator joins the packs in the background
-    objects = NewObjects(repo)
-    tree = objects.add_tree(None, content)
-    why = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
-    trailers = [("Operation", "init"), ("Render-Version", str(RENDER_VERSION))]
-    text = commit_message.compose([["Create the state repo"], [why]], trailers)
-    signature = commit_message.generator_signature(now)
-    commit = objects.add_commit(signer, (signature, signature), text, tree, [])
-    with objects.packed(commit):
-        repo.references.create(f"refs/heads/{MAIN_BRANCH}", commit)
-    if not bare:
-        repo.checkout_head(  # type: ignore[no-untyped-call]
-            strategy=pygit2.enums.CheckoutStrategy.FORCE
-        )
     return str(commit)

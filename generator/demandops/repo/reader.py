@@ -11,7 +11,7 @@ from pathlib import Path
 import pygit2
 from pygit2 import Commit, Oid, Tree
 
-from demandops.base import settings
+from demandops.base import naming, settings
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import with_lines
@@ -20,16 +20,18 @@ from demandops.decide.changeset import FileReader
 from demandops.decide.state import rendered_files
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Rollback
+from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import verification
 from demandops.repo.git import repository as repositories
 from demandops.repo.git import tree as trees
 from demandops.repo.git.remote_repository import connect, is_url
 from demandops.repo.git.repository import StateRepository, access_error, reading
-from demandops.repo.history import commit_log, revisions
+from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
 from demandops.repo.history.commit_message import PROPOSAL
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
+from demandops.repo.load.ledger_files import valid_claim_at
 from demandops.repo.load.snapshot import Problem, Progress, Snapshot
 from demandops.repo.slot import Slot
 from demandops.repo.verification import Verdict
@@ -88,7 +90,7 @@ class Reader:
     def commit(self, revision: str | None = None) -> str:
         if not revision:
             return str(self._tip)
-        return str(revisions.resolve(self._objects, self._tip, revision, REAL.now()).id)
+        return str(commit_log.resolve(self._objects, self._tip, revision, REAL.now()).id)
 
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
@@ -140,8 +142,8 @@ class Reader:
         claims = {
             path
             for path in ledger_files.changed_files(old, new)
-            if (trees.entry(old, path) is None and ledger_files.valid_claim_at(new, path))
-            or (trees.entry(new, path) is None and ledger_files.valid_claim_at(old, path))
+            if (trees.entry(old, path) is None and valid_claim_at(new, path))
+            or (trees.entry(new, path) is None and valid_claim_at(old, path))
         }
         return sorted({path for path, _ in trees.differences(old, new)} - as_rendered - claims)
 
@@ -160,7 +162,7 @@ class Reader:
         since, until = self._sides(spec or "")
         if path is not None:
             changes = commit_log.changes_to(self._objects, until, path, since)
-            return (self._answered(change.entry) for change in changes)
+            return (self._answered(entry) for entry, _, _ in changes)
         entries = (entry for _, entry in commit_log.commits(self._objects, until, since))
         return map(self._answered, entries)
 
@@ -227,16 +229,26 @@ class Reader:
         opened = trees.commit_of(self._objects, commit)
         before = {entry.name: entry.id for entry in trees.parent_tree(opened) or ()}
         after = {entry.name: entry.id for entry in opened.tree}
-        return tuple(
-            sorted(str(name) for name in {*before, *after} if before.get(name) != after.get(name))
-        )
+        changed = {name for name in {*before, *after} if before.get(name) != after.get(name)}
+        return tuple(sorted(map(str, changed)))
 
     def files_changed_by(self, commit: str) -> list[str]:
         after = trees.commit_of(self._objects, commit)
         return sorted(path for path, _ in trees.differences(trees.parent_tree(after), after.tree))
 
     def changes_node(self, commit: str, node: str) -> bool:
-        return ledger_files.changes_node(self._objects, commit, node)
+        opened = trees.commit_of(self._objects, commit)
+        before, after = trees.parent_tree(opened), opened.tree
+        if before is None:
+            return False
+        folder = naming.object_name("", node)
+        for path, _ in trees.differences(before, after, (CLUSTERS_ROOT,)):
+            parts = path.split("/")
+            if len(parts) == 5 and parts[3] == folder:
+                return True
+        paths = ledger_files.changed_files(before, after)
+        claims = (valid_claim_at(tree, path) for path in paths for tree in (before, after))
+        return any(claim is not None and claim.held.needs(node) for claim in claims)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
         since, follows = entry.first("Since"), entry.first("Follows")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -82,7 +81,7 @@ class Agenda:
     What failed waits, each time twice as long, up to a minute: one of these, the end of an override
     or of a lease, or the drain of a node. These last three are tried again at once if a person
     changes the configuration. After an error of the worker ("all"), it publishes demands, but does
-    nothing of the list for that time. Any thread may call :meth:`request_fetch`.
+    nothing of the list for that time. Any thread may set ``wants_fetch``.
     """
 
     def __init__(self, fetch_interval: float, runtime: Runtime, *, local: bool = False) -> None:
@@ -94,7 +93,7 @@ class Agenda:
         self._interval = min(fetch_interval, _LOCAL_S) if local else fetch_interval
         self._fetch_at = now if fetch_interval else inf
         self._fetched_at = now - _SHORTEST_GAP_S
-        self._requested = runtime.event()
+        self.wants_fetch = runtime.event()
         self._check_interval = CHECK_LOCAL_S if local else CHECK_REMOTE_S
         self._checked = ""  # main at the last check
         self._check_began = self._check_at = self._check_new_main_at = 0.0
@@ -113,7 +112,7 @@ class Agenda:
         # whether one was changed
         now, rest = self._runtime.monotonic(), self.waits_s("all")
         fetch = max(self._fetch_at - now, self.waits_s("fetch"))
-        if self._requested.is_set():
+        if self.wants_fetch.is_set():
             fetch = min(fetch, self._fetched_at + _SHORTEST_GAP_S - now)
         check = (now if has_news else self._check_at) if main else inf
         if main and self._checked != main:
@@ -314,12 +313,6 @@ class Agenda:
 
     # ---- fetches ----
 
-    def request_fetch(self) -> None:
-        self._requested.set()
-
-    def fetch_begins(self) -> None:
-        self._requested.clear()  # before the fetch: a later push needs another one
-
     def fetched(self, *, reached: bool, at_least_s: float = 0.0) -> None:
         """Plan the next fetch after a fetch or a push, which both tell of others' commits.
 
@@ -407,13 +400,9 @@ class Backoff:
 
 # ---- the budget of one decision, because other demands wait meanwhile ----
 
-# The usual demand lists a dozen topics; one of so many characters is decided in some 10 ms.
-_USUAL = 20_000
-
-
-def may_take_long(demand: Demand) -> bool:
-    # what was decided before such a demand is published first
-    return len(json.dumps(demand.goal)) > _USUAL
+# The usual demand lists a dozen topics; one of so many characters is decided in some 10 ms. What
+# was decided before a longer one is published first.
+USUAL_LENGTH = 20_000
 
 
 def within(limits: Limits, runtime: Runtime) -> Checkpoint:

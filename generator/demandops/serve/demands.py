@@ -24,7 +24,7 @@ from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import replace
 
 from demandops.base import errors
-from demandops.base.errors import DemandOpsError
+from demandops.base.errors import DemandOpsError, InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
 from demandops.serve.journal import Journal, ProposalRecord, Receipt, State, Ticket
@@ -291,9 +291,8 @@ class Demands:
 
     def _why_refused(self, ticket: Ticket, others: dict[str, Ticket]) -> DemandOpsError | None:
         if self.is_closed:
-            return errors.ShuttingDown(
-                "the generator is shutting down; send the demand again later"
-            )
+            why = "the generator is shutting down; send the demand again later"
+            return errors.ShuttingDown(why)
         # the others were accepted just before, and are not queued yet
         if len(others) + len(self._queue) >= self._limit:
             why = f" and cannot be published ({self.blocked})" if self.blocked else ""
@@ -353,10 +352,8 @@ class Demands:
                 return ticket is not None and ticket.state == "withdrawn"
             try:
                 self._withdraw(ticket, TAKEN_BACK)
-            except (
-                errors.StateRepoError,
-                errors.Unsound,
-            ) as error:  # if unsound, the worker ends the process
+            # if unsound, the worker ends the process
+            except (errors.StateRepoError, errors.Unsound) as error:
                 log.error("demand %s cannot be withdrawn: %s", operation, error)
                 self.wake()
                 return False
@@ -414,11 +411,7 @@ class Demands:
             if isinstance(result, Receipt) or ticket.state == "done":
                 continue
             if str(result) != TAKEN_BACK:  # a client that took its demand back needs no notice
-                text = (
-                    result.text_with_codes()
-                    if isinstance(result, errors.InvalidInput)
-                    else str(result)
-                )
+                text = result.text_with_codes() if isinstance(result, InvalidInput) else str(result)
                 ticket.notify("refused", text)
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]

@@ -17,12 +17,12 @@ from demandops.model.demand.goals import read_goal
 from demandops.repo.git.remote_repository import connect
 from demandops.repo.git.repository import access_error, reading
 from demandops.repo.git.signing import Signer
-from demandops.repo.history import revisions
+from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.slot import Slot
 from demandops.serve.agenda import heartbeat_in
-from demandops.serve.approvals.approvals import Approvals
+from demandops.serve.approvals import Approvals
 from demandops.serve.demands import Demands
 from demandops.serve.journal import Listener, Ticket, open_journal
 from demandops.serve.worker import RemoteStatus, Worker
@@ -122,7 +122,7 @@ class Generator:
         objects = self._repository.reopened()  # as libgit2's objects belong to one thread
         tip, now = self.snapshot.commit, self._runtime.now()
         with reading(self.address, objects):
-            commit = revisions.resolve(objects, tip, revision, now)
+            commit = commit_log.resolve(objects, tip, revision, now)
             return snapshots.state_at(objects, commit.id)
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,23 +12,21 @@ from math import inf
 from demandops.base import errors
 from demandops.base.errors import DemandOpsError, StateRepoError
 from demandops.base.runtime import Runtime
-from demandops.base.settings import MAIN_BRANCH, RENDER_VERSION
+from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand, Rollback
 from demandops.repo.git import repository as repositories
-from demandops.repo.git import signing
 from demandops.repo.git.repository import PushDenied, Unavailable, access_error
-from demandops.repo.git.signing import SigningFailed
+from demandops.repo.git.signing import ALLOWED_SIGNERS, SigningFailed, are_listed
 from demandops.repo.history.commit_log import operations_since
-from demandops.repo.history.commit_message import compose, generator_signature
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.ledger_files import restoration
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve import agenda
 from demandops.serve.agenda import Agenda, Backoff, RateLimit, What
-from demandops.serve.approvals.approvals import Approvals, Result
+from demandops.serve.approvals import Approvals, Result, commit_without_files
 from demandops.serve.demands import TAKEN_BACK, Demands
 from demandops.serve.journal import Receipt, Ticket
 from demandops.templating.evaluator import DEMAND_S, processor_time
@@ -153,7 +152,7 @@ class Worker:
     # ---- from any thread ----
 
     def fetch_now(self) -> None:
-        self._agenda.request_fetch()
+        self._agenda.wants_fetch.set()
         self._demands.wake()
 
     def end_soon(self) -> None:
@@ -306,7 +305,7 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > agenda.LONGEST_EVALUATION_S
-            if number and (is_late or agenda.may_take_long(ticket.demand)):
+            if number and (is_late or len(json.dumps(ticket.demand.goal)) > agenda.USUAL_LENGTH):
                 part, left = part[:number], part[number:] + left
                 break
             if ticket.demand.is_release:
@@ -532,13 +531,7 @@ class Worker:
         if commits.is_empty:
             now = self._runtime.now()
             title, why = "Check that the server takes commits", "Why: it refused another commit."
-            trailers = [
-                ("Operation", "follow"),
-                *commits.head.trailers,
-                ("Render-Version", str(RENDER_VERSION)),
-            ]
-            text = compose([[title], [why]], trailers)
-            commits.commit_files({}, commits.head.state, text, generator_signature(now), now)
+            commit_without_files(commits, [[title], [why]], [("Operation", "follow")], now)
         self._must_fetch = not self._publish_commits(commits, [])
         return None
 
@@ -549,7 +542,7 @@ class Worker:
         is_due = due_in["own work"] == 0
         try:
             if due_in["fetch"] == 0:
-                self._agenda.fetch_begins()
+                self._agenda.wants_fetch.clear()  # before: a later push needs another fetch
                 # a demand that arrives ends the fetch, because its push finds new commits too
                 self._repository.refresh(
                     lambda: self._demands.has_queued or self._demands.is_closed
@@ -560,7 +553,7 @@ class Worker:
             new = is_due or self._repository.tip() != self.snapshot.commit
             self._record_reached(pushed=new and self._carry_out_changes())
         except repositories.FetchInterrupted:
-            self._agenda.request_fetch()  # it is still due
+            self._agenda.wants_fetch.set()  # it is still due
         except StateRepoError as error:
             self._record_failure(error)
             self._agenda.failed("own work")
@@ -598,8 +591,7 @@ class Worker:
         self._leaves_due_work = False
         for _ in range(_TRIES):
             commits = self._new_commit_batch(again=again)
-            if commits.publish():
-                self._record_published(commits)
+            if self._publish_record(commits):
                 return not commits.is_empty
             self._repository.refresh()
             # at random, so that generators which all saw the change do not collide again
@@ -669,13 +661,13 @@ class Worker:
     def _warn_if_unsigned(self) -> None:
         if self._repository.signer is not None or self._warned_of_signers:
             return
-        if signing.are_listed(self._repository.objects, self.snapshot.commit):
+        if are_listed(self._repository.objects, self.snapshot.commit):
             self._warned_of_signers = True
             log.warning(
                 "%s lists who may sign, but this generator has no key, so `verify` will refuse its "
                 "commits, and generators will treat them as commits by a person; start the "
                 "generator with --signing-key",
-                signing.ALLOWED_SIGNERS,
+                ALLOWED_SIGNERS,
             )
 
     def _record_reached(self, *, pushed: bool) -> None:

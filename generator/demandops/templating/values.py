@@ -92,21 +92,22 @@ _ADDRESS = re.compile(" at 0x[0-9a-f]+")
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    def __init__(self, filters: Mapping[str, Callable[..., Any]], **options: Any) -> None:  # noqa: ANN401
-        super().__init__(**options)
-        finalize = self.finalize
-        assert finalize is not None  # noqa: S101 - our own options
+    _COMPILED = CompiledTemplates()
+
+    def __init__(self, load: Callable[[str], tuple[str, str, Callable[[], bool]] | None]) -> None:
+        loader = FunctionLoader(load)
+        super().__init__(loader=loader, bytecode_cache=self._COMPILED, **OPTIONS)
 
         def written(value: object) -> object:
             if isinstance(value, (Iterator, KeysView, ItemsView, ValuesView)):
                 value = [*value]
-            text = finalize(value)
+            text = OPTIONS["finalize"](value)
             if _ADDRESS.search(str(text)):
                 raise SecurityError("a template may write only data, and no function or method")
             return text
 
         self.finalize = written
-        self.filters = {**{name: self.filters[name] for name in _FILTERS}, **filters}
+        self.filters = {**{name: self.filters[name] for name in _FILTERS}, **FILTERS}
         del self.tests["sameas"]  # whether two values are one object is an accident
         del self.globals["lipsum"]  # writes random text
 
@@ -192,7 +193,7 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
 
 
 def takes_requests(defaults: Mapping[str, Any]) -> bool:
-    """Return whether a chart with these default values gives its pods what a service requests."""
+    # whether a chart with these default values gives its pods what a service requests
     return isinstance(defaults.get("resources"), dict)
 
 
@@ -216,9 +217,6 @@ def _with_requests(
     return {**values, "resources": written}
 
 
-_COMPILED = CompiledTemplates()
-
-
 def _rendered(files: Mapping[str, str], task: ValuesTask) -> str:
     def load(path: str) -> tuple[str, str, Callable[[], bool]] | None:
         text = files.get(path)
@@ -227,10 +225,8 @@ def _rendered(files: Mapping[str, str], task: ValuesTask) -> str:
             raise TemplateSyntaxError(message, 1)
         return None if text is None else (text, path, lambda: True)
 
-    loader = FunctionLoader(load)
-    sandbox = Sandbox(FILTERS, loader=loader, bytecode_cache=_COMPILED, **OPTIONS)
     try:
-        text = sandbox.get_template(task.template).render(**task.context)
+        text = Sandbox(load).get_template(task.template).render(**task.context)
         if len(text) <= _MAX_RENDERED:
             return text
         problem, line = f"writes {len(text)} characters; at most {_MAX_RENDERED} are allowed", None

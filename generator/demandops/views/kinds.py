@@ -13,7 +13,7 @@ from typing import Any
 
 from demandops.base.naming import SubjectKind
 from demandops.cluster.health import Health
-from demandops.cluster.release_status import ReleaseStatus
+from demandops.cluster.rollouts import ReleaseStatus
 from demandops.decide.bookkeeping import (
     carried_topics,
     connection_entry,

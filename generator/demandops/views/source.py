@@ -10,7 +10,6 @@ from typing import Any, Generic, TypeVar
 from demandops.base.errors import DemandOpsError
 from demandops.base.naming import SubjectKind
 from demandops.base.runtime import REAL
-from demandops.cluster import rollouts
 from demandops.cluster.health import (
     ClusterDomain,
     Health,
@@ -19,16 +18,18 @@ from demandops.cluster.health import (
     Target,
     health_reader,
 )
-from demandops.cluster.object_cache import ObjectCache
-from demandops.cluster.release_status import (
+from demandops.cluster.rollouts import (
     ChangedPaths,
     OldBootstrap,
     Orphan,
     ReleaseStatus,
+    domains_of_state,
     old_bootstraps,
     orphans,
     statuses,
+    target_of,
 )
+from demandops.cluster.watches import ObjectCache
 from demandops.decide.override_report import Entry, override_report, override_state
 from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
@@ -236,7 +237,7 @@ class Source:
     def _plan(self, key: ReleaseKey) -> Planned | None:
         if (release := plan(self.state, key)) is None:
             return None
-        target = rollouts.target_of(release, self.config.repo_settings)
+        target = target_of(release, self.config.repo_settings)
         return Planned(release, target, claims_behind(self.active.ledger, release))
 
     @_Derived
@@ -337,7 +338,7 @@ class Source:
 
     @_Derived
     def domains(self) -> list[ClusterDomain]:
-        return rollouts.domains_of_state(self.state)
+        return domains_of_state(self.state)
 
     @_Derived
     def watched_objects(self) -> dict[str, list[ObjectSelector]]:

@@ -13,7 +13,7 @@ from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.object_cache import object_caches
+from demandops.cluster.watches import object_caches
 from demandops.repo.git.repository import reading
 from demandops.repo.load.snapshot import Progress
 from demandops.repo.reader import Reader
@@ -78,9 +78,6 @@ class Follower:
         # to iterate would fail if the follower's thread appended meanwhile
         return tuple(self._changes.copy())
 
-    def reader(self) -> Reader:
-        return self._reader.for_another_thread()
-
     def reading(self) -> AbstractContextManager[None]:
         # raises StateRepoError if an object is missing or damaged
         repository = self._reader.repository
@@ -90,7 +87,7 @@ class Follower:
         newest = self.newest
         if not revision:
             return newest
-        reader = self.reader()
+        reader = self._reader.for_another_thread()
         commit = reader.commit(revision)
         if commit == newest.commit:
             return newest

@@ -245,7 +245,7 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     chosen = None if now.is_newest else (now.entry.time, now.commit)
     changed: list[str] = []
     if asked.get("at"):
-        changed = asked.follower.reader().files_changed_by(now.commit)
+        changed = now.reader().files_changed_by(now.commit)
     shown, page, pages = page_of(events, asked.page(), size=50)
     return "timeline.html.j2", {
         "strip": time_line.strip(events, now.now, span, chosen),

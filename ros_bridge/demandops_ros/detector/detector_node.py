@@ -21,7 +21,7 @@ from demandops.base.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_N
 from demandops.base.strict_yaml import read_input
 from demandops.detect.condition import entity_in
 from demandops.detect.detector import Detector, Outcome, Sending, Want, WantedDemands, booked_events
-from demandops.detect.observations import Key, MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Key, MessageReader, Observation, Unreadable
 from demandops.detect.rule_file import Goal, RuleFile, read
 from demandops_interfaces.msg import Bookkeeping
 from rclpy.clock import Clock, ClockType
@@ -108,20 +108,16 @@ class SourceSubscriptions:
     ) -> None:
         self._node, self._file, self._now, self._observe = node, file, now, observe
         self._readers = {name: MessageReader(file, name) for name in file.sources}
-        self._subscriptions: dict[tuple[str, str], Any] = {}
+        self.subscriptions: dict[tuple[str, str], Any] = {}  # by source and topic
         self._told: set[str] = set()
         self.messages = self.unreadable = 0
-
-    @property
-    def topics(self) -> int:
-        return len(self._subscriptions)  # a topic counts once for each source that reads it
 
     def refresh(self) -> None:
         published: Mapping[str, list[str]] = dict(self._node.get_topic_names_and_types())
         for name, source in self._file.sources.items():
             for topic, types in published.items():
                 entity = entity_in(source.topic, topic)
-                if entity is None or (name, topic) in self._subscriptions:
+                if entity is None or (name, topic) in self.subscriptions:
                     continue
                 if source.type not in types:
                     self._tell_once(
@@ -129,19 +125,19 @@ class SourceSubscriptions:
                         f"{name} reads {source.type}"
                     )
                 elif self._node.count_publishers(topic):
-                    self._subscriptions[name, topic] = self._node.create_subscription(
+                    self.subscriptions[name, topic] = self._node.create_subscription(
                         message_class(source.type),
                         topic,
                         partial(self._read, name, topic, entity),
                         _QOS,
                     )
-        for key in [*self._subscriptions]:
+        for key in [*self.subscriptions]:
             if not self._node.count_publishers(key[1]):
-                self._node.destroy_subscription(self._subscriptions.pop(key))
+                self._node.destroy_subscription(self.subscriptions.pop(key))
 
     def close(self) -> None:
-        while self._subscriptions:
-            self._node.destroy_subscription(self._subscriptions.popitem()[1])
+        while self.subscriptions:
+            self._node.destroy_subscription(self.subscriptions.popitem()[1])
 
     def _read(self, source: str, topic: str, entity: str, message: Any) -> None:  # noqa: ANN401
         self.messages += 1
@@ -198,11 +194,10 @@ class DemandSender:
                 self._wanted.want(want)
             self._changed.notify_all()
 
-    def summary(self) -> tuple[int, int, list[tuple[Key, str]]]:
-        # how many events want or hold a demand, how many of these have no answer yet, and why the
-        # last goal of others failed
+    def summary(self) -> tuple[int, list[tuple[Key, str]]]:
+        # how many events have no answer to their demand yet, and why the last goal of others failed
         with self._changed:
-            return len(self._wanted), self._wanted.unanswered(), list(self._wanted.refusals())
+            return self._wanted.unanswered(), list(self._wanted.refusals())
 
     def _run(self) -> None:
         while (sending := self._take()) is not None:
@@ -298,9 +293,13 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._topics = self._subscribe(file)
         self._bookkeeping: Mapping[str, Any] | None = None
         self._books: Any = None
-        if settings["bookkeeping_topic"]:
-            topic = settings["bookkeeping_topic"]
-            self._books = self.create_subscription(Bookkeeping, topic, self._hear_books, LATCHED)
+
+        def hear(message: Any) -> None:  # noqa: ANN401 - a generated class
+            heard = read_bookkeeping(message.bookkeeping_json, self._detector.file)
+            self._bookkeeping = self._bookkeeping if heard is None else heard
+
+        if topic := settings["bookkeeping_topic"]:
+            self._books = self.create_subscription(Bookkeeping, topic, hear, LATCHED)
         else:
             self._bookkeeping = {}
         # by a steady clock, because a simulated one may be what is missing
@@ -332,10 +331,6 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._observations.append(observation)
 
     # ---- start: find the demands of the earlier run ----
-
-    def _hear_books(self, message: Any) -> None:  # noqa: ANN401 - a generated class
-        heard = read_bookkeeping(message.bookkeeping_json, self._detector.file)
-        self._bookkeeping = self._bookkeeping if heard is None else heard
 
     def _say_what_is_missing(self) -> None:
         self._patience.cancel()
@@ -410,14 +405,14 @@ class DetectorNode(Node):  # type: ignore[misc]
 
         missing = "" if self._is_started else "waiting for the bookkeeping or /clock"
         values = {
-            "topics": str(self._topics.topics),
+            "topics": str(len(self._topics.subscriptions)),
             "entities": str(detector.entities),
             "messages": str(self._topics.messages),
             "messages left out": str(self._topics.unreadable),
         }
         add("data", "detecting", values, warning=missing)
 
-        _, unanswered, refusals = self._sender.summary()
+        unanswered, refusals = self._sender.summary()
         text, failed = "every demand is answered", ""
         if unanswered:
             text = f"{unanswered} demands have no answer yet"

@@ -17,7 +17,7 @@ from demandops.cli.formats import Table
 from demandops.cli.output import errors
 from demandops.detect.condition import Count, Near, entity_in
 from demandops.detect.detector import Detector
-from demandops.detect.observations import Event, Key, MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Event, Key, MessageReader, Observation, Unreadable
 from demandops.detect.rule_file import Goal, RuleFile
 from demandops.views.rows import Column
 from rosbags.highlevel import AnyReader
@@ -109,24 +109,41 @@ class RecordedBag:
 _WIDTH, _MAP, _ROW, _LEFT, _RIGHT, _EDGE = 1000, 600, 22, 300, 30, 30
 _COLORS = ("#0b6e99", "#c2410c", "#15803d", "#7e22ce", "#b91c1c", "#4d7c0f", "#be185d", "#1d4ed8")
 
-Span = tuple[float, float]
-
 
 def svg(replay: Replay) -> str:
-    spans: dict[Key, list[Span]] = {}  # by rule and entities; inf: not stopped
+    spans: dict[Key, list[tuple[float, float]]] = {}  # by rule and entities; inf: not stopped
     for event, _ in replay.events:
         if event.starts:
             spans.setdefault(event.key, []).append((event.at, inf))
         else:
             spans[event.key][-1] = spans[event.key][-1][0], event.at
     rows = [*spans.items()][:200]
-    height = _MAP + _ROW * (len(rows) + 3)
     colors: dict[str, str] = {}
 
     def color_of(entity: str) -> str:
         return colors.setdefault(entity, _COLORS[len(colors) % len(_COLORS)])
 
-    parts = [*_map(replay, color_of), *_times(replay, rows, color_of)]
+    parts = [*_map(replay, color_of)]
+    start, end = replay.span
+    factor = (_WIDTH - _LEFT - _RIGHT) / ((end - start) or 1)
+    bottom = _MAP + _ROW * (len(rows) + 1)
+    step = _round((end - start) or 1) / 2
+    for tick in range(ceil((end - start) / step) + 1 if end > start else 1):
+        x = _LEFT + tick * step * factor
+        if x <= _WIDTH - _RIGHT:
+            parts.append(f'<path d="M{x:.1f} {_MAP}V{bottom}" stroke="#ddd"/>\n')
+            parts.append(_text(x, bottom + 14, f"{tick * step:g} s", "black"))
+    for number, ((rule, subjects), bars) in enumerate(rows, start=1):
+        y = _MAP + _ROW * number
+        color = color_of(subjects[0]) if subjects else "#444"
+        parts.append(_text(_EDGE, y, f"{rule} {' '.join(subjects)}", "black"))
+        for since, until in bars:
+            x, width = _LEFT + (since - start) * factor, (min(until, end) - since) * factor
+            parts.append(
+                f'<rect x="{x:.1f}" y="{y - 11}" width="{max(width, 1):.1f}" height="14" '
+                f'fill="{color}"/>\n'
+            )
+    height = bottom + 2 * _ROW
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" '
         'style="font-family:sans-serif;font-size:12px">'
@@ -135,7 +152,7 @@ def svg(replay: Replay) -> str:
 
 
 def _round(span: float) -> float:
-    """Return the largest of 0.1, 0.2, 0.5, 1, 2 … up to a quarter of ``span``, or 0.1."""
+    # the largest of 0.1, 0.2, 0.5, 1, 2 … up to a quarter of ``span``, or 0.1
     steps = [mantissa * 10.0**power for power in range(-1, 7) for mantissa in (1, 2, 5)]
     return max((step for step in steps if step <= span / 4), default=steps[0])
 
@@ -193,30 +210,6 @@ def _map(replay: Replay, color_of: Callable[[str], str]) -> Iterator[str]:
     length = metres * factor
     yield f'<path d="M{_EDGE} {_MAP - 12}h{length:.1f}" stroke="black" stroke-width="3"/>\n'
     yield _text(_EDGE, _MAP - 18, f"{metres:g} m", "black")
-
-
-def _times(
-    replay: Replay, rows: list[tuple[Key, list[Span]]], color_of: Callable[[str], str]
-) -> Iterator[str]:
-    start, end = replay.span
-    factor = (_WIDTH - _LEFT - _RIGHT) / ((end - start) or 1)
-    bottom = _MAP + _ROW * (len(rows) + 1)
-    step = _round((end - start) or 1) / 2
-    for tick in range(ceil((end - start) / step) + 1 if end > start else 1):
-        x = _LEFT + tick * step * factor
-        if x <= _WIDTH - _RIGHT:
-            yield f'<path d="M{x:.1f} {_MAP}V{bottom}" stroke="#ddd"/>\n'
-            yield _text(x, bottom + 14, f"{tick * step:g} s", "black")
-    for number, ((rule, subjects), spans) in enumerate(rows, start=1):
-        y = _MAP + _ROW * number
-        color = color_of(subjects[0]) if subjects else "#444"
-        yield _text(_EDGE, y, f"{rule} {' '.join(subjects)}", "black")
-        for since, until in spans:
-            x, width = _LEFT + (since - start) * factor, (min(until, end) - since) * factor
-            yield (
-                f'<rect x="{x:.1f}" y="{y - 11}" width="{max(width, 1):.1f}" height="14" '
-                f'fill="{color}"/>\n'
-            )
 
 
 def _text(x: float, y: float, text: str, color: str) -> str:

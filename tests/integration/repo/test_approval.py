@@ -18,8 +18,7 @@ from demandops.base.errors import StateRepoError
 from demandops.cli.main import run
 from demandops.decide.state import rendered_files
 from demandops.model.demand.demand import Lease
-from demandops.serve import agenda
-from demandops.serve.approvals import approvals
+from demandops.serve import agenda, approvals
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig

@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlparse
 
 import pytest
-from demandops.serve.approvals import forge_worker
+from demandops.serve import proposal
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
@@ -73,7 +73,7 @@ def hub() -> Iterator[Hub]:
 
 @pytest.fixture
 def petra(hub: Hub, petra: Person, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Person:
-    monkeypatch.setattr(forge_worker, "POLL_S", 0.05)
+    monkeypatch.setattr(proposal, "POLL_S", 0.05)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
     (tmp_path / "token").write_text(TOKEN)
     monkeypatch.setenv("DEMANDOPS_FORGE_TOKEN_FILE", str(tmp_path / "token"))

@@ -161,7 +161,7 @@ def test_what_was_decided_is_published_before_a_large_demand_is_begun(
     generator: Generator,
 ) -> None:
     told = list[tuple[str, str]]()
-    topics = [f"/t{number}" for number in range(300)]
+    topics = [f"/t{number:070}" for number in range(300)]
     big = goals.goal([], [goals.connection("c9", who=["r9"], topics=topics)], id="9")
     with rig.busy(generator, rig.goal(1)):
         sent = [

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from demandops.repo.git.remote_repository import GitResult
 from demandops.repo.git.repository import MAIN, PushDenied
-from demandops.serve.approvals import approvals
+from demandops.serve import approvals
 
 from tests.kit import config, goals, plain_yaml, rig
 from tests.kit.clock import Clock

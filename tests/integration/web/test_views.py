@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 from demandops.cluster.health import Health
-from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
+from demandops.cluster.rollouts import OldBootstrap, Orphan, ReleaseStatus
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease

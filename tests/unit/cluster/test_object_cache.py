@@ -15,10 +15,9 @@ from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.config_map_watch import ConfigMapWatch
 from demandops.cluster.health import ClusterDomain, ObjectSelector, Target
-from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.rollouts import RolloutWatcher
+from demandops.cluster.watches import ConfigMapWatch, ObjectCache
 from demandops.decide.decision import decide
 
 from tests.kit import goals

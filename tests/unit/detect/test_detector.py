@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 from demandops.detect.detector import Detector, Outcome, Sending, Want, WantedDemands, booked_events
-from demandops.detect.observations import Key, Observation
+from demandops.detect.event_engine import Key, Observation
 from demandops.detect.rule_file import Goal
 
 from tests.kit import plain_yaml

@@ -7,7 +7,7 @@ from itertools import combinations, product
 from math import hypot
 from typing import Any
 
-from demandops.detect.observations import Observation
+from demandops.detect.event_engine import Observation
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -17,7 +17,7 @@ DOMAINS = "policy/access-domains.yaml"
 FORMS = {file: Form(model.model_json_schema()) for file, model in rich.CONFIG_MODELS.items()}
 DOCUMENTS = [
     *((rich.rich, file) for file in FORMS),
-    *((rich.rich, f"overrides/{name}.yaml") for name in ("hold", "deny", "keep")),
+    *((rich.rich, f"overrides/{name}.yaml") for name in ("hold", "deny", "keep", "refuse-new")),
     (rich.rich_with_api, "demandops.yaml"),
 ]
 PROBES = ("startupProbe", "readinessProbe", "livenessProbe")

@@ -19,7 +19,7 @@ from demandops.base.errors import InvalidInput
 from demandops.model.config.load import load
 from demandops.model.config.repo_settings import Proposals
 from demandops.repo.forge import Forge, ForgeError, Gitea, PullRequest, forge_for
-from demandops.serve.approvals.forge_worker import ForgeWorker
+from demandops.serve.proposal import ForgeWorker
 
 from tests.kit import plain_yaml
 from tests.kit.config import configuration

@@ -70,6 +70,22 @@ def test_a_name_in_an_address_is_accepted_and_not_shown(tmp_path: Path, name: st
     assert str(error.value).startswith("http://127.0.0.1:9/state.git cannot be fetched: ")
 
 
+def test_it_costs_a_fetch_to_look_at_a_url(tmp_path: Path) -> None:
+    source = _with_main(tmp_path / "state.git")
+    assert connect(str(source), tmp_path / "data").on_this_disk
+    assert not connect(source.as_uri(), tmp_path / "data").on_this_disk
+    git(source, "config", "core.sharedRepository", "group")  # so its clone is pushed
+    pushed = connect(str(source), tmp_path / "of-a-folder")
+    assert (pushed.always_current, pushed.on_this_disk) == (False, True)
+
+
+def test_what_a_remote_has_confirmed_is_not_written_to_the_clone_again(tmp_path: Path) -> None:
+    repository = connect(_with_main(tmp_path / "state.git").as_uri(), tmp_path / "data")
+    repository.write_anew("")
+    # a `main` of the clone's own would soon be outdated, and people may write `main`
+    assert [*repository.reopened().references] == ["refs/remotes/origin/main"]
+
+
 def test_the_clone_keeps_its_address_for_its_owner_alone(tmp_path: Path) -> None:
     source = _with_main(tmp_path / "state.git")
     connect(source.as_uri(), tmp_path / "data")

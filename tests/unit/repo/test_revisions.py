@@ -13,7 +13,7 @@ import pygit2
 import pytest
 from demandops.base.errors import StateRepoError
 from demandops.repo.git import tree as trees
-from demandops.repo.history import commit_log, revisions
+from demandops.repo.history import commit_log
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pygit2 import Oid
@@ -31,13 +31,13 @@ TABLES = plain_yaml.load(Path(__file__).with_name("revisions.yaml").read_text())
 
 @pytest.mark.parametrize("text", TABLES["times"])
 def test_a_time_begins_and_ends(text: str) -> None:
-    found = [revisions.parse_time(text, NOW, end=end) for end in (False, True)]
+    found = [commit_log.parse_time(text, NOW, end=end) for end in (False, True)]
     assert found == [one.replace(tzinfo=timezone.utc) for one in TABLES["times"][text]]
 
 
 @pytest.mark.parametrize("text", TABLES["no_times"])
 def test_a_text_that_is_no_time_gives_none(text: str) -> None:
-    assert revisions.parse_time(text, NOW) is None
+    assert commit_log.parse_time(text, NOW) is None
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def repo(tmp_path: Path) -> pygit2.Repository:
 def commit_of(repo: pygit2.Repository, text: str) -> pygit2.Commit:
     tip = repo.references[MAIN].target
     assert isinstance(tip, pygit2.Oid)
-    return revisions.resolve(repo, tip, text, NOW)
+    return commit_log.resolve(repo, tip, text, NOW)
 
 
 def test_the_name_of_a_tag_comes_before_a_time(repo: pygit2.Repository) -> None:
@@ -187,7 +187,9 @@ class History:
         return {*git(self.repo.path, "log", "--format=%H", tip, "--", path).split()}
 
     def ours(self, path: str) -> list[str]:
-        return [t.entry.commit for t in commit_log.changes_to(self.repo, self.made[-1], path)]
+        return [
+            entry.commit for entry, _, _ in commit_log.changes_to(self.repo, self.made[-1], path)
+        ]
 
 
 @pytest.mark.parametrize("seed", range(6))

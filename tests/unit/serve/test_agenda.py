@@ -108,16 +108,16 @@ def test_many_requests_give_one_poll_and_one_more_after_it(clock: Clock) -> None
     made = Agenda(0, clock)
     assert fetch_in(made) == inf
     for _ in range(3):
-        made.request_fetch()
+        made.wants_fetch.set()
     assert fetch_in(made) == 0
-    made.fetch_begins()
+    made.wants_fetch.clear()
     assert fetch_in(made) == inf
-    made.request_fetch()  # this comes during the poll, which may have missed its cause
+    made.wants_fetch.set()  # this comes during the poll, which may have missed its cause
     made.fetched(reached=True)
     assert fetch_in(made) == 0.5, "a burst of requests must not give one poll each"
     clock.pass_(0.5)
     assert fetch_in(made) == 0
-    made.fetch_begins()
+    made.wants_fetch.clear()
     made.fetched(reached=True)
     assert fetch_in(made) == inf
 

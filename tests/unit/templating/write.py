@@ -20,7 +20,7 @@ CHARTS = [
     path.parent
     for top in ("appdefs", "examples")
     for path in sorted((ROOT / top).rglob("Chart.yaml"))
-    if path.parent != LIBRARY
+    if path.parent != LIBRARY and LIBRARY.name in path.read_text()  # those made with the library
 ]
 
 

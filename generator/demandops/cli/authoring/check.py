@@ -18,7 +18,7 @@ from demandops.decide.changeset import CHANGE_ORDER, FileChange
 from demandops.repo.merge_check import merge_check
 from demandops.repo.merge_check.merge_check import CheckResult
 from demandops.repo.merge_check.rendered_charts import MISSING, NO_HELM, RenderedCharts
-from demandops.serve.approvals.proposal import backticks
+from demandops.serve.proposal import backticks
 from demandops.templating.evaluator import processor_time
 from demandops.views.vocabulary import Json
 

@@ -38,9 +38,9 @@ from demandops.decide.decision import decide
 from demandops.model.config.base_model import duration_text
 from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
-from demandops.serve.approvals.proposal import parse_waiting_text
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Receipt
+from demandops.serve.proposal import parse_waiting_text
 from demandops.views.vocabulary import Json
 
 

@@ -53,7 +53,7 @@ from demandops.repo.write.proposal_branch import (
     ProposalBranches,
     pending_proposals,
 )
-from demandops.serve.approvals.proposal import merge_request
+from demandops.serve.proposal import merge_request
 from demandops.views import vocabulary
 from demandops.views.vocabulary import Json
 

@@ -21,7 +21,7 @@ from demandops.decide.bookkeeping import bookkeeping as derive
 from demandops.decide.changeset import MergePreview, ReleaseChange, planned_releases, preview
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
-from demandops.repo.history import revisions
+from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
@@ -141,7 +141,7 @@ def differences(
 def resolved(repo: Reader, revision: str | None) -> str:
     """Return the id of a commit; if a time names it, say which commit that is."""
     commit, text = repo.commit(revision), revision or ""
-    time = revisions.parse_time(text, REAL.now(), end=True)
+    time = commit_log.parse_time(text, REAL.now(), end=True)
     if time is not None and not commit.startswith(text.lower()):
         entry = next(repo.log(commit))
         errors.print(
@@ -203,9 +203,9 @@ _TRAILERS = {
 def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
     if text is None:
         return None
-    time = revisions.parse_time(text, REAL.now(), end=param.name == "until")
+    time = commit_log.parse_time(text, REAL.now(), end=param.name == "until")
     if time is None:
-        raise click.BadParameter(f"'{text}' is not a time; write it like {revisions.TIMES}")
+        raise click.BadParameter(f"'{text}' is not a time; write it like {commit_log.TIMES}")
     return time
 
 
@@ -237,7 +237,7 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
     "--since",
     callback=_time,
     metavar="TIME",
-    help=f"List only commits at or after this time: {revisions.TIMES}.",
+    help=f"List only commits at or after this time: {commit_log.TIMES}.",
 )
 @click.option(
     "--until", callback=_time, metavar="TIME", help="List only commits at or before this time."

@@ -21,8 +21,8 @@ from demandops.cli.queries.commits import in_effect, log_table
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
+from demandops.cluster.watches import ObjectCache
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.base_model import duration_text, seconds_of
 from demandops.repo import reader

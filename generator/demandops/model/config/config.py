@@ -28,27 +28,18 @@ from demandops.model.config.repo_settings import RepoSettings
 
 # ---- the whole configuration as one frozen, indexed value: :class:`Config` ----
 
-CLUSTERS_FILE = "inventory/clusters.yaml"
-NODES_FILE = "inventory/nodes.yaml"
-BROKERS_FILE = "inventory/brokers.yaml"
-DOMAINS_FILE = "policy/access-domains.yaml"
-CHARTS_FILE = "registry/charts.yaml"
-IMAGES_FILE = "registry/images.yaml"
-CLIENTS_FILE = "registry/clients.yaml"
-VERSIONS_FILE = "registry/versions.yaml"
-
 # The collections of entries, each named by the file that usually lists its entries. Files in the
 # folder `inventory/nodes/` may list further entries of the collection `inventory/nodes.yaml`, and
 # likewise for the others (`collection_of`).
 COLLECTIONS = (
-    CLUSTERS_FILE,
-    NODES_FILE,
-    BROKERS_FILE,
-    DOMAINS_FILE,
-    CHARTS_FILE,
-    IMAGES_FILE,
-    CLIENTS_FILE,
-    VERSIONS_FILE,
+    CLUSTERS_FILE := "inventory/clusters.yaml",
+    NODES_FILE := "inventory/nodes.yaml",
+    BROKERS_FILE := "inventory/brokers.yaml",
+    DOMAINS_FILE := "policy/access-domains.yaml",
+    CHARTS_FILE := "registry/charts.yaml",
+    IMAGES_FILE := "registry/images.yaml",
+    CLIENTS_FILE := "registry/clients.yaml",
+    VERSIONS_FILE := "registry/versions.yaml",
 )
 
 # The top-level entries of a state repo that hold the configuration, which people write

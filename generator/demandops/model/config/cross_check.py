@@ -21,14 +21,11 @@ from demandops.templating import charts
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:
-    for check in (
-        _check_inventory,
-        _check_domains,
-        _check_charts,
-        _check_services,
-        _check_versions,
-    ):
-        check(config, reader)
+    _check_inventory(config, reader)
+    _check_domains(config, reader)
+    _check_charts(config, reader)
+    _check_services(config, reader)
+    _check_versions(config, reader)
     for connection_type in connection_types.by_number():
         reader.faults += connection_type.config_faults(config, reader)
     _check_overrides(config, reader)
@@ -110,39 +107,34 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
 def _check_charts(config: Config, reader: ConfigReader) -> None:
     for name, chart in config.charts.items():
         file, place = reader.places[configs.CHARTS_FILE][name]
-        _check_chart(file, place, chart, config, reader)
-        for channel, source in chart.channels.items():
-            _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
+        sources: dict[str, ChartSource] = {place: chart}
+        sources |= {f"{place}.channels.{name}": source for name, source in chart.channels.items()}
+        for where, source in sources.items():
+            path = f"{source.folder}/Chart.yaml"
+            text = config.files.get(path)
+            if not source.folder:
+                continue
+            if text is None:
+                message = f"'{path}' does not exist; correct the folder"
+                if not path.startswith("appdefs/"):
+                    message = f"'{source.folder}' is not in appdefs/; move the chart there"
+                reader.add_fault(file, f"{where}.folder", message)
+                continue
+            try:
+                metadata = strict_yaml.load(text, path)
+            except InvalidInput as error:
+                reader.faults += error.faults
+                continue
+            version = metadata.get("version") if isinstance(metadata, dict) else None
+            if version != source.version:
+                message = f"is {source.version}, but {path} says {version}; make them equal"
+                if version is None:
+                    message = f"is {source.version}, but {path} has no version; add it there"
+                reader.add_fault(file, f"{where}.version", message)
     tops = (source.folder for chart in config.charts.values() for source in chart.sources())
     folders = (folder for top in tops if top for folder in charts.folders(top, config.files))
     for folder in dict.fromkeys(folders):  # each library once, in the order in which it is needed
         reader.faults += charts.faults(folder, config.files)
-
-
-def _check_chart(
-    file: str, where: str, chart: ChartSource, config: Config, reader: ConfigReader
-) -> None:
-    if not chart.folder:
-        return
-    path = f"{chart.folder}/Chart.yaml"
-    text = config.files.get(path)
-    if text is None:
-        message = f"'{path}' does not exist; correct the folder"
-        if not path.startswith("appdefs/"):
-            message = f"'{chart.folder}' is not in appdefs/; move the chart there"
-        reader.add_fault(file, f"{where}.folder", message)
-        return
-    try:
-        metadata = strict_yaml.load(text, path)
-    except InvalidInput as error:
-        reader.faults += error.faults
-        return
-    version = metadata.get("version") if isinstance(metadata, dict) else None
-    if version != chart.version:
-        message = f"is {chart.version}, but {path} says {version}; make them equal"
-        if version is None:
-            message = f"is {chart.version}, but {path} has no version; add it there"
-        reader.add_fault(file, f"{where}.version", message)
 
 
 def _check_services(  # noqa: PLR0912 - a branch for each fault

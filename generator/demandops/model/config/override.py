@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, StringConstraints, ValidationError, model_validator
@@ -26,6 +26,7 @@ from demandops.model.config.base_model import (
     Pattern,
     Visible,
     parse_time,
+    time_text,
 )
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.model.config.policy import matches
@@ -41,8 +42,7 @@ EFFECTS = (*_SHAPING, "hold", "deny", "refuseNew", "keep")
 
 
 def format_time(moment: datetime) -> str:
-    text = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
-    return re.sub(r"\.?0*\+00:00$", "Z", text)
+    return re.sub(r"\.?0*Z$", "Z", time_text(moment))
 
 
 def _one_line(text: str) -> str:

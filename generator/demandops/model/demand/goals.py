@@ -76,28 +76,21 @@ class DemandGoal(FrozenModel):
     positions: list[GoalPosition] = Field(default_factory=list)
     answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
 
-    def faults(self) -> Iterator[Fault]:
+    def faults(self) -> Iterator[Fault]:  # noqa: PLR0912 - a branch for each fault
         if verb := self.operation if self.operation != "put" else "":
             listed = "applications" if self.applications else "connections"
             remedy = "leave the field out; to change the demand, send a put"
             if verb == "release":
                 remedy = "to release a part of the demand, put the demand without that part"
-            for name, given, message in (
-                (
-                    "lease",
-                    self.lease is not None,
-                    "is set by a put; leave it out, or put the demand again",
-                ),
-                (
-                    listed,
-                    self.applications or self.connections,
-                    f"a {verb} names only its demand; {remedy}",
-                ),
-                ("priority", self.priority, f"a {verb} does not wait for room; leave priority out"),
-                ("positions", self.positions, f"a {verb} chooses no node; leave the positions out"),
-            ):
-                if given:
-                    yield fault(name, message)
+            if self.lease is not None:
+                yield fault("lease", "is set by a put; leave it out, or put the demand again")
+            if self.applications or self.connections:
+                yield fault(listed, f"a {verb} names only its demand; {remedy}")
+            if self.priority:
+                message = f"a {verb} does not wait for room; leave priority out"
+                yield fault("priority", message)
+            if self.positions:
+                yield fault("positions", f"a {verb} chooses no node; leave the positions out")
         for index, app in enumerate(self.applications):
             for role, topics in app.inputs.items():
                 for place, topic in enumerate(topics):

@@ -181,7 +181,7 @@ _PUSH = (
 class RemoteRepository(StateRepository):
     """A state repo behind a URL, in a bare clone."""
 
-    always_current = False
+    always_current = on_this_disk = False
     main_reference = _REMOTE_MAIN
     branches = "refs/remotes/origin/"
 
@@ -256,9 +256,7 @@ class RemoteRepository(StateRepository):
             self._folder = folder
 
     def _fetch(
-        self,
-        urgent: Callable[[], bool] = lambda: False,
-        timeout: float = repositories.TIMEOUT_S,
+        self, urgent: Callable[[], bool] = lambda: False, timeout: float = repositories.TIMEOUT_S
     ) -> None:
         # The refspec is not in git's configuration. If it were, a push that outlives its generator
         # would move the reference.
@@ -299,6 +297,9 @@ class RemoteRepository(StateRepository):
             text = "commit %s was pushed, but the clone %s cannot record this: %s"
             log.warning(text, commit, self._folder, error)
         return True
+
+    def write_anew(self, since: str) -> None:
+        pass  # the remote has synced what it confirms
 
     def list_references(self, *patterns: str) -> dict[str, str]:
         listed = self._run_git("ls-remote", "--quiet", self._url, *patterns)
@@ -497,11 +498,7 @@ def is_url(address: str) -> bool:
 
 
 def connect(
-    address: str,
-    folder: Path,
-    *,
-    allow_offline: bool = False,
-    only_read: bool = False,
+    address: str, folder: Path, *, allow_offline: bool = False, only_read: bool = False
 ) -> StateRepository:
     """Return the state repo at an address: a URL, or a folder where main is not checked out.
 

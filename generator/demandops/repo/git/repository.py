@@ -394,11 +394,7 @@ class StateRepository:
             # pack does not let git write the whole history again
             [
                 *child_processes.git(self.objects.path),
-                "repack",
-                "--geometric=2",
-                "-d",
-                "-l",
-                "--quiet",
+                *("repack", "--geometric=2", "-d", "-l", "--quiet"),
             ],
             env=os.environ | child_processes.git_environment(),
             stdout=subprocess.DEVNULL,

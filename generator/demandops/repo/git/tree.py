@@ -49,7 +49,7 @@ MAX_DEPTH = 64  # how many folders deep a file may be; deeper folders are not re
 
 def commit_of(repo: Repository, commit: str | Oid) -> Commit:
     # An id as text may come from a trailer or the journal, so it may be any text. What people write
-    # is read by `revisions.resolve`.
+    # is read by `commit_log.resolve`.
     try:
         if isinstance(commit, str) and not re.fullmatch("[0-9a-f]{40}", commit):
             raise StateRepoError(f"{quoted(commit)} is no commit's id of 40 hexadecimal digits")

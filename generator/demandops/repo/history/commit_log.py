@@ -1,4 +1,4 @@
-"""The history: its commits, and who made or caused them."""
+"""The history: its commits, who made or caused them, and how people name them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, timezone
+from datetime import datetime, timedelta, timezone
 from functools import cache
+from itertools import islice
 from typing import Literal, NamedTuple, get_args
 
 import pygit2
@@ -16,8 +17,9 @@ from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
 from demandops.base.errors import StateRepoError
-from demandops.base.quoting import one_line
+from demandops.base.quoting import one_line, quoted
 from demandops.base.settings import GENERATED_ROOTS
+from demandops.model.config.base_model import seconds_of
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.ledger.claim import LEDGER_ROOT
 from demandops.render.gitops import CLUSTERS_ROOT
@@ -33,6 +35,7 @@ from demandops.repo.history.commit_message import (
     generator_signature,
     parse,
     signature,
+    time_text,
 )
 
 # ---- the history: commits with their trailers, and which commits changed a path ----
@@ -87,8 +90,8 @@ def _time(seconds: int) -> datetime:
     return datetime.fromtimestamp(min(max(seconds, 0), _LAST_SECOND), tz=timezone.utc)
 
 
-def _raw_author(commit: Commit) -> tuple[str, str]:
-    return _text(commit.author.raw_name), _text(commit.author.raw_email)
+def _name_and_email(who: pygit2.Signature) -> tuple[str, str]:
+    return _text(who.raw_name), _text(who.raw_email)
 
 
 def _text(raw: bytes) -> str:
@@ -98,7 +101,7 @@ def _text(raw: bytes) -> str:
 
 def entry_of(commit: Commit) -> LogEntry:
     text = parse(_text(commit.raw_message))
-    committer = _text(commit.committer.raw_name), _text(commit.committer.raw_email)
+    committer = _name_and_email(commit.committer)
     is_ours, is_proposal = committer == (GENERATOR_NAME, GENERATOR_EMAIL), PROPOSAL in text.trailers
     # a person's message has no trailers for programs, unless it keeps those of a merged proposal,
     # or rejects one
@@ -106,7 +109,7 @@ def entry_of(commit: Commit) -> LogEntry:
     return LogEntry(
         commit=str(commit.id),
         time=time_of(commit),
-        author=_raw_author(commit)[0],
+        author=_name_and_email(commit.author)[0],
         summary=text.summary,
         trailers=text.trailers if is_told else {},
         why=text.why if is_told else "",
@@ -138,14 +141,14 @@ def answered(repo: Repository, entry: LogEntry, tip: Oid, merged: Mapping[str, C
         return replace(entry, answer=Answer("approved", by, time, "", commit)) if by else entry
     made = commit_of(repo, commit)
     if merge := merged.get(commit):
-        by, time, commit = _raw_author(merge)[0], time_of(merge), str(merge.id)
+        by, time, commit = _name_and_email(merge.author)[0], time_of(merge), str(merge.id)
         # forges repeat the title of the pull request there
         told = _text(merge.raw_message).split("\n\n")[1:2]
         reason = "".join(told).strip() if told != [entry.summary] else ""
     elif tip != made.id and not repo.descendant_of(tip, made.id):
         return entry  # it is on no branch but its own
     else:
-        committer = _text(made.committer.raw_name), _text(made.committer.raw_email)
+        committer = _name_and_email(made.committer)
         by = "" if committer == (GENERATOR_NAME, GENERATOR_EMAIL) else committer[0]
         by = entry.author if committer == _GITHUB else by  # it squashes and rebases for a person
     return replace(entry, answer=Answer("approved", by, time, one_line(reason), commit))
@@ -267,13 +270,6 @@ def rejections_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, L
 
 
 @dataclass(frozen=True, slots=True)
-class PathChange:
-    entry: LogEntry
-    existed_before: bool
-    exists_after: bool
-
-
-@dataclass(frozen=True, slots=True)
 class PathHistory:
     started: LogEntry | None  # added the path; None if it never existed
     newest: tuple[LogEntry, ...]  # changed it afterwards, newest first
@@ -283,25 +279,26 @@ class PathHistory:
 
 def changes_to(
     repo: Repository, tip: str | Oid, path: str, after: str | None = None
-) -> Iterator[PathChange]:
+) -> Iterator[tuple[LogEntry, bool, bool]]:
+    # newest first; with whether the path existed before, and exists after
     for revision in _git_log(repo, tip, after, "--format=%H", f":(literal){path}"):
         commit = commit_of(repo, revision)
         before = any(trees.entry(parent.tree, path) is not None for parent in commit.parents)
-        yield PathChange(entry_of(commit), before, trees.entry(commit.tree, path) is not None)
+        yield entry_of(commit), before, trees.entry(commit.tree, path) is not None
 
 
 def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHistory:
     started = stopped = None
     changes: list[LogEntry] = []
     more = 0
-    for change in changes_to(repo, tip, path):
-        if not change.exists_after:
-            stopped = change.entry
-        elif not change.existed_before:
-            started = change.entry
+    for entry, existed, exists in changes_to(repo, tip, path):
+        if not exists:
+            stopped = entry
+        elif not existed:
+            started = entry
             break
         elif len(changes) < most:
-            changes.append(change.entry)
+            changes.append(entry)
         else:
             more += 1
     return PathHistory(started, tuple(changes), more, stopped)
@@ -387,7 +384,7 @@ def _touches(commit: Commit, paths: Iterable[str]) -> bool:
 
 
 def author_of(commit: Commit) -> Person:
-    plain = signature(*_raw_author(commit), time_of(commit))
+    plain = signature(*_name_and_email(commit.author), time_of(commit))
     return Person(plain.name, plain.email)
 
 
@@ -420,3 +417,128 @@ def operator(folder: str | None = None) -> Person:
     name = configured("GIT_AUTHOR_NAME", "user.name") or login
     email = configured("GIT_AUTHOR_EMAIL", "user.email") or f"{login}{_NO_ADDRESS}"
     return Person(name, email)
+
+
+# ---- revisions: points in history as people write them: a branch, a tag, an id, or a time ----
+#
+# A time means the newest commit along the first parents that was committed at or before this time.
+# A date means the end of its day, and a time without seconds the end of its minute. A time without
+# a zone is UTC, like all times that the program prints.
+
+# Examples of the times that parse_time accepts.
+TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago)"
+
+_DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
+_CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2})?")
+_DAY, _MINUTE, _SECOND = timedelta(days=1), timedelta(minutes=1), timedelta(seconds=1)
+_REVISION = re.compile(r"([^~^]+)((?:\^|~[0-9]{0,9})*)")
+_STEP = re.compile(r"[~^]([0-9]*)")
+_ID = re.compile(r"[0-9A-Fa-f]{4,40}")
+_WHOLE_ID = 40
+_SPACES = ("refs/", "refs/tags/", "refs/heads/", "refs/remotes/")
+_BRANCHES_AND_TAGS = ("refs/heads/", "refs/tags/", "refs/remotes/")
+_LONGEST = 250  # bytes; a file system takes no longer name of a branch
+
+
+def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | None:
+    """Return the time that a date, a time of day, both, or a duration before ``now`` names.
+
+    A time of day without a date means its last occurrence before ``now``. With ``end``, a date
+    means the end of its day, and a time without seconds the end of its minute.
+    """
+    text = text.strip()
+    try:
+        return now - timedelta(seconds=seconds_of(text.removesuffix("ago").rstrip()))
+    except ValueError:
+        pass
+    has_no_seconds = re.match(r"\d{1,2}:\d{2}(?!:?\d)", re.split(r"[T ]", text)[-1])
+    precision = _DAY if _DATE.fullmatch(text) else _MINUTE if has_no_seconds else _SECOND
+    clock = _CLOCK.fullmatch(text)
+    if clock:
+        hours, minutes = text.split(":", 1)
+        text = f"{now.astimezone(timezone.utc):%Y-%m-%d}T{hours:0>2}:{minutes}"
+    try:
+        time = datetime.fromisoformat(re.sub(r"[Zz]$", "+00:00", text))
+        zone = time.tzinfo or timezone.utc
+        time = time.replace(tzinfo=zone).astimezone(timezone.utc)
+    except (ValueError, OverflowError):
+        return None
+    if clock and time > now:
+        time -= _DAY
+    return time + (precision - _SECOND) if end else time
+
+
+def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
+    # The text is from outside: a time, the name of a branch or tag, or 4 to 40 digits of an id. A
+    # name or id may be followed by ``~N`` or ``^``, along the first parents. ``HEAD`` is ``tip``.
+    # libgit2 never parses the text: its own grammar has searches, some of which crash it.
+    text = text.strip(" ")
+    is_plain = text.isprintable() and len(text.encode(errors="replace")) <= _LONGEST
+    match = _REVISION.fullmatch(text) if is_plain else None
+    try:
+        commit = _commit_named(repo, tip, match[1], match[2], now) if match else None
+    except (KeyError, ValueError, pygit2.GitError) as error:
+        raise StateRepoError(
+            f"{quoted(text)} names no commit that can be read: {error.args[0]}; name another "
+            "commit, or check the repository with `git fsck`"
+        ) from None
+    if commit is None:
+        raise StateRepoError(
+            f"{quoted(text)} is neither a commit of the state repo nor a time; write a branch, a "
+            "tag or 4 to 40 digits of an id, with ~N for the Nth commit before it, or a time like "
+            f"{TIMES}; `demandops log` lists the commits"
+        )
+    return commit
+
+
+def _commit_named(
+    repo: Repository, tip: Oid, base: str, steps: str, now: datetime
+) -> Commit | None:
+    names = _names(repo, base)
+    # a branch may be named like a time, such as 2026-01-31
+    at = None if names or steps else parse_time(base, now, end=True)
+    if at is not None:
+        latest = int(at.timestamp())
+        for commit in first_parents(repo, tip):
+            if commit.commit_time <= latest:
+                return commit
+        raise StateRepoError(
+            f"at {time_text(at)} the state repo did not exist yet; its first commit is of "
+            f"{time_text(time_of(commit))}"
+        )
+    commits = {name: repo.references[name].peel(Commit) for name in names}
+    if base == "HEAD":
+        commits[base] = commit_of(repo, tip)
+    elif _ID.fullmatch(base) and base.lower() in repo:
+        named = repo[base.lower()]
+        # digits that also begin the id of a file do not make a name ambiguous
+        if not names or isinstance(named, Commit):
+            commits[f"the commit {named.id}"] = named.peel(Commit)
+    if len({commit.id for commit in commits.values()}) > 1:
+        raise StateRepoError(
+            f"{quoted(base)} is ambiguous: it means {' and '.join(commits)}; write the whole id, "
+            "or a whole name that begins with refs/"
+        )
+    back = sum(int(count or 1) for count in _STEP.findall(steps))
+    for commit in commits.values():
+        walked = first_parents(repo, commit.id)
+        if (ancestor := next(islice(walked, back, None), None)) is None:
+            raise StateRepoError(
+                f"{quoted(base)} has fewer than {back} commits before it; write a smaller ~N"
+            )
+        return ancestor
+    return None
+
+
+def _names(repo: Repository, base: str) -> list[str]:
+    # whoever may push a branch must not change what a whole id or HEAD means
+    if base == "HEAD" or (len(base) == _WHOLE_ID and _ID.fullmatch(base)):
+        return []
+    valid = [
+        name
+        for name in (base, *(f"{space}{base}" for space in _SPACES))
+        if name.startswith(_BRANCHES_AND_TAGS) and pygit2.reference_is_valid_name(name)
+    ]
+    names = [name for name in valid if name in repo.references]
+    tracked = f"refs/remotes/origin/{base}"  # as in a clone, or a checkout of another branch
+    return names or [tracked for _ in valid[:1] if tracked in repo.references]

@@ -6,15 +6,13 @@ from collections.abc import Iterable, Iterator
 
 from pygit2 import Oid, Repository, Tree
 
-from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.naming import Subject
 from demandops.decide.booking import Restoration
-from demandops.model.demand.demand import Lease, Rollback
+from demandops.model.demand.demand import Rollback
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import Claim, ClaimKey
 from demandops.model.ledger.ledger import Ledger
-from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log, commit_message
 
@@ -63,21 +61,11 @@ def owner_faults(claim: Claim | None, was: Claim | None, path: str) -> Iterator[
 
 def as_last_written(repo: Repository, to: Oid, path: str) -> Claim | None:
     """Return the newest valid claim that a generator, or a merged proposal, wrote to a file."""
-    for change in commit_log.changes_to(repo, to, path):
-        if change.entry.trailers:  # a person's commit has none
-            tree = trees.commit_of(repo, change.entry.commit).tree
-            claim = valid_claim_at(tree, path)
-            if claim or not change.exists_after:
+    for entry, _, exists in commit_log.changes_to(repo, to, path):
+        if entry.trailers:  # a person's commit has none
+            claim = valid_claim_at(trees.commit_of(repo, entry.commit).tree, path)
+            if claim or not exists:
                 return claim
-    return None
-
-
-def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
-    for commit in commit_log.first_parents(repo, to):
-        claim = valid_claim_at(commit.tree, path)
-        # a merged proposal's lease has not started; the one before it has
-        if claim is None or claim.lease is None or claim.lease.has_started:
-            return claim.lease if claim else None
     return None
 
 
@@ -124,21 +112,3 @@ def changed_subjects(before: Ledger, after: Ledger) -> list[Subject]:
 def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
     changed = trees.differences(before, after, (claim_files.LEDGER_ROOT,))
     return (path for path, _ in changed if claim_files.kind_of(path) is not None)
-
-
-def changes_node(repo: Repository, revision: str | Oid, node: str) -> bool:
-    commit = trees.commit_of(repo, revision)
-    before, after = trees.parent_tree(commit), commit.tree
-    if before is None:
-        return False
-    folder = naming.object_name("", node)
-    for path, _ in trees.differences(before, after, (CLUSTERS_ROOT,)):
-        parts = path.split("/")
-        if len(parts) == 5 and parts[3] == folder:
-            return True
-    claims = (
-        valid_claim_at(tree, path)
-        for path in changed_files(before, after)
-        for tree in (before, after)
-    )
-    return any(claim is not None and claim.held.needs(node) for claim in claims)

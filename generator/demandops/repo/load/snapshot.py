@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from types import MappingProxyType
 from typing import NamedTuple
 
 from pygit2 import Commit, Oid, Repository, Tree
@@ -39,6 +38,7 @@ from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load import ledger_files
+from demandops.repo.load.ledger_files import valid_claim_at
 from demandops.templating.evaluator import DEMAND_S, EVALUATE, processor_time
 
 Progress = Callable[[int, int], None]
@@ -348,7 +348,11 @@ def with_started_leases(repo: Repository, followed: Followed, now: datetime) -> 
     for claim in ledger.unstarted_claims():
         assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
         path = claim_files.path_of(claim.key)
-        earlier = ledger_files.lease_before_approval(repo, snapshot.commit, path)
+        line = commit_log.first_parents(repo, snapshot.commit)
+        claims = (valid_claim_at(commit.tree, path) for commit in line)
+        leases = (was.lease if was else None for was in claims)
+        # a merged proposal's lease has not started; the one before it has
+        earlier = next((lease for lease in leases if lease is None or lease.has_started), None)
         started = replace(claim, lease=claim.lease.started(now, earlier))
         ledger = ledger.replace(claim.key, started)
         files[path] = claim_files.text_of(started)
@@ -414,7 +418,7 @@ def _ledger_after(repo: Repository, before: Snapshot, commit: Commit) -> _Ledger
             ledger = replace(ledger, waiting=ledger.waiting.insert(waits.demand, waits))
             faults.append(fault("", "is not a valid waiting demand").within(path))
     for path in ledger_files.changed_files(old, new):
-        was = before.put_back.get(path) or ledger_files.valid_claim_at(old, path)
+        was = before.put_back.get(path) or valid_claim_at(old, path)
         put_back.pop(path, None)
         try:
             claim = ledger_files.claim_at(new, path)
@@ -558,7 +562,7 @@ def _without(state: State, changes: Iterable[ClaimChange]) -> State:
     return state.with_ledger(ledger, undone) if undone else state
 
 
-def render_all(tree: Tree, state: State, more: Files = MappingProxyType({})) -> Changeset:
+def render_all(tree: Tree, state: State, more: Files) -> Changeset:
     """Return the generated files that differ from those of ``tree``, and the files ``more``."""
     generated = trees.texts(tree, GENERATED_ROOTS)
     files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))

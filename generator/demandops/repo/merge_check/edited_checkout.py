@@ -7,8 +7,8 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -33,7 +33,7 @@ from demandops.model.release import Release, ServiceRelease
 from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import PARTIAL, open_folder, reading
-from demandops.repo.history import revisions
+from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot as snapshots
 
 # ---- overrides in place of manual edits, for values, replicas and images ----
@@ -221,23 +221,22 @@ def _written_tree(folder: Path, repo: Repository, scratch: Path) -> Tree:
     git("add", "--update")
     git("update-index", "--add", "--replace", "-z", "--stdin", stdin=b"\0".join(new))
     (tree,) = git("write-tree", "--missing-ok")
-    entries = git("ls-tree", "-r", "-l", "-z", tree.decode(), *ROOTS)
-    listed = [entry.partition(b"\t") for entry in entries]
-
-    def why_not_read(about: bytes, path: bytes) -> str:
+    reasons, total = dict[bytes, str](), 0
+    for entry in git("ls-tree", "-r", "-l", "-z", tree.decode(), *ROOTS):
+        about, _, path = entry.partition(b"\t")
         mode, _, _, size = about.split()
         if mode == b"120000":  # it may point to a file that the report must not show
-            return "is a symbolic link, which is not followed; replace it by a file"
-        if mode == b"160000":
-            return _NESTED
-        if path.count(b"/") > trees.MAX_DEPTH:
-            return f"is more than {trees.MAX_DEPTH} folders deep; move it up"
-        return (
-            f"has more than {_LARGEST >> 20} MiB; make it smaller" if int(size) > _LARGEST else ""
-        )
-
-    _refuse({path: why_not_read(about, path) for about, _, path in listed})
-    if sum(int(about.split()[3]) for about, _, _ in listed) > _MOST:
+            reasons[path] = "is a symbolic link, which is not followed; replace it by a file"
+        elif mode == b"160000":
+            reasons[path] = _NESTED
+        elif path.count(b"/") > trees.MAX_DEPTH:
+            reasons[path] = f"is more than {trees.MAX_DEPTH} folders deep; move it up"
+        elif int(size) > _LARGEST:
+            reasons[path] = f"has more than {_LARGEST >> 20} MiB; make it smaller"
+        else:
+            total += int(size)
+    _refuse(reasons)
+    if total > _MOST:
         raise StateRepoError(f"{folder} has more than {_MOST >> 20} MiB to check; take files out")
     repo.odb.add_disk_alternate(str(objects))
     return repo[tree.decode()].peel(Tree)
@@ -247,9 +246,10 @@ _NESTED = "belongs to another Git repository, whose files are not read; remove i
 
 
 def _refuse(reasons: Mapping[bytes, str]) -> None:
-    faults = [fault("", why).within(trees.printable(path)) for path, why in reasons.items() if why]
-    if faults:
-        raise InvalidInput(faults)
+    if reasons:
+        raise InvalidInput(
+            fault("", why).within(trees.printable(path)) for path, why in reasons.items()
+        )
 
 
 # ---- the commit that an edit started from ----
@@ -288,7 +288,7 @@ def base_of(repo: Repository, revision: str | None, files: Mapping[str, str]) ->
     target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
     head = repo.head.peel(Commit)
     try:
-        tip = revisions.resolve(repo, head.id, target, REAL.now()) if target else None
+        tip = commit_log.resolve(repo, head.id, target, REAL.now()) if target else None
         common = repo.merge_base(head.id, tip.id) if tip is not None else None
     except (StateRepoError, pygit2.GitError, KeyError):
         if repo.is_shallow:
@@ -301,17 +301,20 @@ def base_of(repo: Repository, revision: str | None, files: Mapping[str, str]) ->
             f"HEAD and {target} have no commit in common; name the merge target with --base"
         )
     commit = head if common is None else trees.commit_of(repo, common)
-    base = Base(str(commit.id), trees.texts(commit.tree, ROOTS), None, False)
-    if tip is not None:
-        _, newer = repo.ahead_behind(head.id, tip.id)
-        theirs = trees.texts(tip.tree, ROOTS) if newer else {}
-        name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
-        base = replace(base, target=name, newer=newer, theirs=theirs)
-    try:
+    newer = repo.ahead_behind(head.id, tip.id)[1] if tip is not None else 0
+    state, valid = None, False
+    with suppress(InvalidInput, StateRepoError):
         snapshot = snapshots.state_at(repo, commit.id)
-    except (InvalidInput, StateRepoError):
-        return base
-    return replace(base, state=snapshot.state, valid=not snapshot.problems)
+        state, valid = snapshot.state, not snapshot.problems
+    return Base(
+        str(commit.id),
+        trees.texts(commit.tree, ROOTS),
+        state,
+        valid,
+        target.removeprefix("refs/remotes/").removeprefix("refs/heads/"),
+        newer,
+        trees.texts(tip.tree, ROOTS) if tip is not None and newer else {},
+    )
 
 
 def author_of(repo: Repository) -> str:

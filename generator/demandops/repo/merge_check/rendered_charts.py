@@ -117,13 +117,7 @@ class Helm:
             "HELM_PLUGINS": str(home / "plugins"),
             **child_processes.mark(),
         }
-        command = [
-            sys.executable,
-            "-IS",
-            confined_process.__file__,
-            str(_HELM_CPU_S),
-            self.program,
-        ]
+        command = [sys.executable, "-IS", confined_process.__file__, str(_HELM_CPU_S), self.program]
         # files, because a pipe would keep in memory whatever a hostile chart prints
         files = home / "out", home / "err"
         with files[0].open("wb") as out, files[1].open("wb") as err:

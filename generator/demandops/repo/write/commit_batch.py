@@ -172,8 +172,8 @@ class CommitBatch:
             config = decision.state.config
             file = config.file_of(NODES_FILE, config.host_of(node))
             changes = commit_log.changes_to(self._objects, self.start.configuration, file)
-            by_people = (change.entry for change in changes if not change.entry.by_generator)
-            causes = [trees.commit_of(self._objects, e.commit) for e in islice(by_people, 1)]
+            by_people = (entry.commit for entry, _, _ in changes if not entry.by_generator)
+            causes = [trees.commit_of(self._objects, each) for each in islice(by_people, 1)]
             caused_by = commit_log.caused_by_trailers(causes)
             more = [*caused_by, *self.head.trailers]
             text = commit_message.of_decision(decision, operation, now, more)

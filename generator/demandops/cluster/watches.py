@@ -1,14 +1,17 @@
-"""A cache of a cluster's objects; watches keep it current, so that reading it never waits."""
+"""Watches of clusters: a cache of their objects, which never waits, and the data of a ConfigMap."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+from demandops.base.errors import InvalidInput
+from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL, Runtime
-from demandops.cluster.clusters_file import ClusterAccess, reason_of
+from demandops.cluster.clusters_file import ClusterAccess, own_cluster_api, reason_of
 from demandops.cluster.health import ClusterDomain, Health, Key, ObjectSelector, health_reader
 
 log = logging.getLogger("demandops")
@@ -27,6 +30,45 @@ _KINDS = {
 WATCH_S = 240
 CONNECT_S = 5
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
+
+
+def keep_watching(
+    api: Callable[[], Callable[..., Any]],
+    request: Mapping[str, str],
+    read: Callable[[], str],
+    take: Callable[[str, Any], None],
+    tell: Callable[[Exception], None],
+    closed: Any,  # noqa: ANN401 - an event of a runtime
+) -> None:
+    """Watch objects until ``closed``; if that fails, tell why and begin again.
+
+    ``api`` gives the library's function that lists them by ``request``. ``read`` lists them and
+    returns the version of the list, and ``take`` gets each change after it, with the object.
+    """
+    pause = _FIRST_PAUSE_S
+    while not closed.is_set():
+        try:
+            from kubernetes import watch  # noqa: PLC0415 - slow (half a second), so only on use
+
+            for event in watch.Watch().stream(
+                api(),
+                **request,
+                resource_version=read(),
+                timeout_seconds=WATCH_S,
+                _request_timeout=(CONNECT_S, WATCH_S + 30),
+            ):
+                if closed.is_set():
+                    return
+                if event["type"] in ("ADDED", "MODIFIED", "DELETED"):
+                    take(event["type"], event["object"])
+            pause = _FIRST_PAUSE_S
+        except Exception as error:  # the library raises errors of many kinds
+            tell(error)
+            closed.wait(pause)
+            pause = min(pause * 2, _LONGEST_PAUSE_S)
+
+
+# ---- the cache of what Flux or Argo CD and their releases are doing ----
 
 
 class ObjectCache:
@@ -199,42 +241,6 @@ def object_caches(
     return {name: ObjectCache(name, readable[name], on_change, runtime) for name in readable}
 
 
-def keep_watching(
-    api: Callable[[], Callable[..., Any]],
-    request: Mapping[str, str],
-    read: Callable[[], str],
-    take: Callable[[str, Any], None],
-    tell: Callable[[Exception], None],
-    closed: Any,  # noqa: ANN401 - an event of a runtime
-) -> None:
-    """Watch objects until ``closed``; if that fails, tell why and begin again.
-
-    ``api`` gives the library's function that lists them by ``request``. ``read`` lists them and
-    returns the version of the list, and ``take`` gets each change after it, with the object.
-    """
-    pause = _FIRST_PAUSE_S
-    while not closed.is_set():
-        try:
-            from kubernetes import watch  # noqa: PLC0415 - slow (half a second), so only on use
-
-            for event in watch.Watch().stream(
-                api(),
-                **request,
-                resource_version=read(),
-                timeout_seconds=WATCH_S,
-                _request_timeout=(CONNECT_S, WATCH_S + 30),
-            ):
-                if closed.is_set():
-                    return
-                if event["type"] in ("ADDED", "MODIFIED", "DELETED"):
-                    take(event["type"], event["object"])
-            pause = _FIRST_PAUSE_S
-        except Exception as error:  # the library raises errors of many kinds
-            tell(error)
-            closed.wait(pause)
-            pause = min(pause * 2, _LONGEST_PAUSE_S)
-
-
 def _request(selector: ObjectSelector) -> dict[str, str]:
     request = {**_KINDS[selector.kind], "namespace": selector.namespace}
     if selector.name:  # a call for one object needs fewer rights than for a whole namespace
@@ -258,3 +264,80 @@ def _reason(selector: ObjectSelector, error: Exception) -> str:
 def _version(item: dict[str, Any]) -> int:
     # Kubernetes calls it opaque, but all API servers count, within one kind of object at least.
     return int(item["metadata"]["resourceVersion"])
+
+
+# ---- one ConfigMap: its data as soon as it exists, and when they change ----
+
+_GONE = "is gone; its last data stay valid"
+
+
+class ConfigMapWatch:
+    """Reads and watches a ConfigMap. It needs only the right to list and watch this object."""
+
+    def __init__(
+        self,
+        namespace: str,
+        name: str,
+        on_data: Callable[[Mapping[str, str]], object],
+        kubeconfig: Path | None,
+    ) -> None:
+        # ``on_data`` is called from the thread of the watch. The ConfigMap need not exist yet.
+        # Without a kubeconfig, this process must be a pod in the cluster.
+        self._name, self._on_data = f"ConfigMap {namespace}/{name}", on_data
+        self._request = {"namespace": namespace, "field_selector": f"metadata.name={name}"}
+        if kubeconfig is None:
+            self._client = own_cluster_api("without --kubeconfig").api_client
+        else:
+            try:
+                self._client = ClusterAccess(kubeconfig=kubeconfig).api().api_client
+            except Exception as error:  # the library raises errors of many kinds
+                reason = f"cannot be used: {one_line(str(error))}"
+                raise InvalidInput.at("--kubeconfig", reason, file=str(kubeconfig)) from None
+        self._data: dict[str, str] | None = None
+        self._told = ""
+        self._closed = REAL.event()
+        # Held while this calls on_data or the log, which both may call ROS. After `close` ROS ends,
+        # and a call of it from this thread would abort the process
+        self._calling = REAL.lock()
+        REAL.keep_running("config-map", self._run)
+
+    def close(self) -> None:
+        """Stop the watch; a call of ``on_data`` is waited for, and no other one follows."""
+        with self._calling:
+            self._closed.set()
+
+    def _run(self) -> None:
+        from kubernetes import client  # noqa: PLC0415 - slow (half a second), so only on use
+
+        api = client.CoreV1Api(self._client).list_namespaced_config_map
+
+        def read() -> str:
+            listed = api(**self._request, _request_timeout=(CONNECT_S, WATCH_S))
+            for item in listed.items:
+                take("ADDED", item)
+            if not listed.items:
+                self._tell("does not exist yet" if self._data is None else _GONE)
+            return str(listed.metadata.resource_version)
+
+        def take(change: str, item: Any) -> None:  # noqa: ANN401 - the library has no types
+            if change == "DELETED":
+                self._tell(_GONE)
+                return
+            self._told = ""  # so that the next failure is logged again
+            data = dict(item.data or {})
+            with self._calling:
+                if data != self._data and not self._closed.is_set():
+                    self._data = data
+                    self._on_data(data)
+
+        def tell(error: Exception) -> None:
+            reason = getattr(error, "reason", None) or error or type(error).__name__
+            self._tell(f"cannot be read: {one_line(str(reason))[:300]}; retrying")
+
+        keep_watching(lambda: api, self._request, read, take, tell, self._closed)
+
+    def _tell(self, text: str) -> None:
+        with self._calling:
+            if text != self._told and not self._closed.is_set():
+                self._told = text
+                log.warning("%s %s", self._name, text)

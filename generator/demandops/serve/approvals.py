@@ -13,6 +13,7 @@ import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import TypeAlias
 
@@ -29,6 +30,7 @@ from demandops.repo.git.repository import PushDenied, StateRepository
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.history.commit_log import RecordedOutcome
+from demandops.repo.history.commit_message import generator_signature
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Snapshot
@@ -39,8 +41,10 @@ from demandops.repo.write.proposal_branch import (
     ProposalBranches,
     branch_name,
 )
-from demandops.serve.approvals.forge_worker import ForgeWorker
-from demandops.serve.approvals.proposal import (
+from demandops.serve.demands import TAKEN_BACK, Demands
+from demandops.serve.journal import ProposalRecord, Receipt, Ticket
+from demandops.serve.proposal import (
+    ForgeWorker,
     Proposal,
     Verdict,
     admit_or_none,
@@ -53,8 +57,6 @@ from demandops.serve.approvals.proposal import (
     releases,
     waiting_text,
 )
-from demandops.serve.demands import TAKEN_BACK, Demands
-from demandops.serve.journal import ProposalRecord, Receipt, Ticket
 
 log = logging.getLogger("demandops")
 
@@ -130,11 +132,9 @@ class Approvals:
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier):
-            if (
-                request
-                and isinstance(result, Decision)
-                and releases(request, [result.request], state.config)
-            ):
+            if not (request and isinstance(result, Decision)):
+                continue
+            if releases(request, [result.request], state.config):
                 earlier[index] = (ticket, errors.Withdrawn(RELEASED))
                 by.has_released = True
 
@@ -263,20 +263,15 @@ class Approvals:
             proposal, reason = self._unrecorded.pop()
             self._changed.append(proposal.branch)
             demands = dict.fromkeys(each.demand or each.id for each in proposal.requests)
-            trailers = [
-                *commit_message.rejection_trailers(
-                    proposal.branch,
-                    proposal.record.commits[-1],
-                    [each.demand for each in proposal.requests],
-                    sorted(proposal.requesters()),
-                    reason,
-                ),
-                *commits.head.trailers,
-                ("Render-Version", str(RENDER_VERSION)),
-            ]
-            text = commit_message.compose([[f"Reject {', '.join(demands)}: {reason}"]], trailers)
-            author = commit_message.generator_signature(now)
-            commits.commit_files({}, commits.head.state, text, author, now)
+            trailers = commit_message.rejection_trailers(
+                proposal.branch,
+                proposal.record.commits[-1],
+                [each.demand for each in proposal.requests],
+                sorted(proposal.requesters()),
+                reason,
+            )
+            title = f"Reject {', '.join(demands)}: {reason}"
+            commit_without_files(commits, [[title]], trailers, now)
         if not publish(commits):
             log.info("another writer was first; recording the rejections again")
 
@@ -313,7 +308,10 @@ class Approvals:
                 proposal.record = replace(proposal.record, pushed=False)
             # the branch is to contain only the demands that still need approval
             before, is_updated = proposal.tickets, False
-            proposal.wait_for(verdict.unapproved)
+            proposal.tickets = [ticket for ticket, _ in verdict.unapproved]
+            proposal.requests = [decision.request for _, decision in verdict.unapproved]
+            why = (reason for _, decision in verdict.unapproved for reason in decision.approval)
+            proposal.reasons = tuple(dict.fromkeys(why))
             try:
                 is_updated = self._update(proposal, verdict, snapshot, heads)
             finally:
@@ -331,9 +329,8 @@ class Approvals:
         self._demands.answer(verdict.failed)
         self._demands.requeue(verdict.free)
         if not verdict.unapproved:
-            proposal.wait_for([])
-            why = next((error for _, error in verdict.failed), "it needs no approval any more")
-            self._forget(proposal, "" if booked else str(why))
+            cause = next((error for _, error in verdict.failed), "it needs no approval any more")
+            self._forget(proposal, "" if booked else str(cause))
 
     def _receipt(
         self,
@@ -489,6 +486,17 @@ def _release_request(ticket: Ticket, state: State) -> Demand | None:
     if ticket.state == "withdrawn" or not ticket.demand.is_release:
         return None
     return admit_or_none(state, ticket.demand)
+
+
+def commit_without_files(
+    commits: CommitBatch,
+    paragraphs: list[list[str]],
+    trailers: Iterable[tuple[str, str]],
+    now: datetime,
+) -> None:
+    trailers = [*trailers, *commits.head.trailers, ("Render-Version", str(RENDER_VERSION))]
+    text, author = commit_message.compose(paragraphs, trailers), generator_signature(now)
+    commits.commit_files({}, commits.head.state, text, author, now)
 
 
 def _belongs_to_another(branch: str) -> Refused:

@@ -1,1 +1,0 @@
-"""Demands that wait for a person: proposals, pull requests, answers."""
