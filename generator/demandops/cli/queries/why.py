@@ -13,7 +13,7 @@ from demandops.cli.formats import output_formats, output_option, show
 from demandops.cli.output import at_option, busy, fitted, terminal_width
 from demandops.cli.queries.commits import loaded
 from demandops.cli.target import name_options, names_of, state_repo_option
-from demandops.decide.admission.may import may_demand
+from demandops.decide.decision import may_demand
 from demandops.model.config.base_model import duration_text
 from demandops.repo import reader
 from demandops.repo.write.proposal_branch import pending_proposals
