@@ -304,7 +304,7 @@ class LastingResults(ActionServer):  # type: ignore[misc]
 class OtherServers:
     def __init__(self, node: Node, actions: Iterable[str]) -> None:
         self._node = node
-        self._own = f"{node.get_namespace().rstrip('/')}/{node.get_name()}"
+        self._own = node.get_fully_qualified_name()
         self._found = {node.resolve_service_name(action): list[str]() for action in actions}
 
     def find(self) -> dict[str, list[str]]:

@@ -25,7 +25,7 @@ from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.base.settings import DEFAULT_ACTION_NAME
 from demandops.cli.main import run
-from demandops_ros.actions import DEEP_QOS, ask_the_node
+from demandops_ros.actions import DEEP_QOS, DEEP_SERVICES, ask_the_node
 from demandops_ros.messages import fill_message
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
@@ -191,10 +191,7 @@ class Client:
         self.node = rclpy.create_node("test_client", context=self._context)
         self.executor = SingleThreadedExecutor(context=self._context)
         self.executor.add_node(self.node)
-        qos = {
-            f"{service}_service_qos_profile": DEEP_QOS for service in ("goal", "result", "cancel")
-        }
-        self._client = ActionClient(self.node, DeploymentRequest, action, **qos)
+        self._client = ActionClient(self.node, DeploymentRequest, action, **DEEP_SERVICES)
         # an action client forgets a goal's feedback once it has the result; a subscription does not
         self._sent: dict[bytes, Sent] = {}
         self.node.create_subscription(

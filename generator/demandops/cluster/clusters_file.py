@@ -23,9 +23,7 @@ from demandops.model.config.base_model import (
     readable_by,
 )
 
-
-def _webhook(text: str) -> None:
-    addresses.url(text, "https", "http")
+_Url = Annotated[str, readable_by(lambda text: addresses.url(text, "https", "http"))]
 
 
 class ClusterAccess(FrozenModel):
@@ -33,8 +31,8 @@ class ClusterAccess(FrozenModel):
 
     kubeconfig: Path | None = Field(default=None, strict=False)
     context: str | None = None
-    receiver: Annotated[str, readable_by(_webhook)] | None = None
-    webhook: Annotated[str, readable_by(_webhook)] | None = None
+    receiver: _Url | None = None
+    webhook: _Url | None = None
     secret_file: Path | None = Field(default=None, strict=False)
     wake: bool = True
 

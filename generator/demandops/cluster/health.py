@@ -8,7 +8,7 @@ are followed.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -180,19 +180,6 @@ def deployment_health(deployment: Object) -> Health:
             message = str(problem.get("message", ""))
             return Health("reconciled", message, name, failing=True)
     return Health("reconciled", f"{available} of {wanted} replicas are available", name)
-
-
-def why_unavailable(pods: Iterable[Any]) -> str:
-    for pod in pods:
-        for container in pod.status.container_statuses or ():
-            waiting = container.state.waiting if container.state else None
-            if waiting and waiting.reason not in (None, "ContainerCreating"):
-                message = f": {waiting.message}" if waiting.message else ""
-                return f"container {container.name}: {waiting.reason}{message}"
-        for reported in pod.status.conditions or ():
-            if reported.type == "PodScheduled" and reported.status == "False":
-                return f"not scheduled: {reported.message}"
-    return ""
 
 
 def condition(status: Object, kind: str) -> Object:

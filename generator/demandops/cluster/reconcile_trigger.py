@@ -20,10 +20,10 @@ from demandops.base.runtime import REAL, Runtime
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import REQUESTED_AT, ClusterDomain, Flux, ObjectSelector
+from demandops.cluster.rollouts import cluster_domain
 from demandops.cluster.watches import object_caches
 from demandops.model.config.config import Config
-from demandops.model.config.policy import AccessDomain
-from demandops.render.gitops import domain_folder, domains_in_use, project_of
+from demandops.render.gitops import domains_by_cluster
 
 # ---- signed calls to a controller's webhook ----
 #
@@ -108,13 +108,13 @@ ChangesSince = Callable[[str], tuple[str, list[str] | None]]
 class _Wake:
     # a planned call that makes the controller of access domains fetch; in monotonic seconds
     cluster: str
-    domains: tuple[AccessDomain, ...]
+    domains: tuple[ClusterDomain, ...]
     pushed: float | None = None  # the oldest push that still needs a call
     next_try: float = -inf
     pause: float = _FIRST_RETRY_S
     idle_from: float = -inf  # since when the controller is known to be idle; inf while it is busy
     # For each domain, what `Flux.handled_request` returned just before the last call.
-    handled: dict[str, str] = field(default_factory=dict)
+    handled: dict[ClusterDomain, str] = field(default_factory=dict)
 
     @property
     def due(self) -> float:
@@ -199,7 +199,10 @@ class ReconcileTrigger:
         self._wakes = {}
         for cluster in sorted(self._clusters):
             access = self._clusters[cluster]
-            domains = tuple(domain for name, domain in domains_in_use(config) if name == cluster)
+            domains = tuple(
+                cluster_domain(cluster, domain, config.repo_settings)
+                for domain in domains_by_cluster(config).get(cluster, ())
+            )
             argocd = config.repo_settings.gitops == "argocd"
             # one call of a webhook wakes all domains, but the API needs a call for each
             together = bool(access.webhook if argocd else access.receiver) or not access.kubeconfig
@@ -218,7 +221,7 @@ class ReconcileTrigger:
             objects, flux = cache.objects(), Flux()
             try:
                 is_idle = all(
-                    flux.is_idle(_on_cluster(wake, domain), objects, wake.handled.get(domain.name))
+                    flux.is_idle(domain, objects, wake.handled.get(domain))
                     for domain in wake.domains
                 )
             # an odd object must not keep other clusters from being woken
@@ -230,16 +233,14 @@ class ReconcileTrigger:
             wake.idle_from = self._runtime.monotonic()
 
     def _try(self, wake: _Wake) -> None:
-        assert self._config is not None  # noqa: S101 - without a push there is no wake
         objects = self._caches[wake.cluster].objects() if wake.cluster in self._caches else {}
         wake.idle_from, wake.handled = inf, {}
         with suppress(Exception):  # an odd object must not keep its cluster from being woken
             wake.handled = {
-                domain.name: Flux().handled_request(_on_cluster(wake, domain), objects)
-                for domain in wake.domains
+                domain: Flux().handled_request(domain, objects) for domain in wake.domains
             }
         try:
-            self._call(wake, self._clusters[wake.cluster], self._config)
+            self._call(wake)
             wake.pushed = None
         except Exception as error:
             wake.handled = {}
@@ -253,9 +254,11 @@ class ReconcileTrigger:
             wake.pause *= 2
         self._note_idle(wake)
 
-    def _call(self, wake: _Wake, access: ClusterAccess, config: Config) -> None:
-        name = wake.cluster
-        argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
+    def _call(self, wake: _Wake) -> None:
+        assert self._config is not None  # noqa: S101 - without a push there is no wake
+        name, settings = wake.cluster, self._config.repo_settings
+        access = self._clusters[name]
+        argocd = settings.argocd if settings.gitops == "argocd" else None
         if argocd and access.webhook:
             before = self._reported.get(name, "")
             commit, paths = self._changes_since(before)
@@ -265,21 +268,17 @@ class ReconcileTrigger:
                 # Files of the ledger and of other clusters concern no Application of this cluster.
                 own, others = f"clusters/{name}/", ("clusters/", "ledger/")
                 paths = [p for p in paths if p.startswith(own) or not f"{p}/".startswith(others)]
-                folders = [domain_folder(name, domain) for domain in wake.domains]
-                paths += [f"{folder}/_domain.yaml" for folder in folders]
+                paths += [f"{own}{domain.name}/_domain.yaml" for domain in wake.domains]
             call_argocd(access.webhook, access.secret(), argocd.url, before, commit, paths)
             self._reported[name] = commit
         elif access.receiver and not argocd:
             # a Receiver ignores the body
             _send(access.receiver, b"{}", access.secret(), "X-Signature", {})
         elif access.kubeconfig:
-            settings, cache = config.repo_settings, self._caches[name]
-            asked_at = {REQUESTED_AT: self._runtime.now().isoformat()}
+            cache, asked_at = self._caches[name], {REQUESTED_AT: self._runtime.now().isoformat()}
             for domain in wake.domains:
-                if argocd:
-                    folder = project_of(domain, settings)
-                    application = ObjectSelector("Application", argocd.namespace, folder)
-                    cache.annotate(application, {"argocd.argoproj.io/refresh": "normal"})
+                if domain.application is not None:
+                    cache.annotate(domain.application, {"argocd.argoproj.io/refresh": "normal"})
                 else:
                     source = ObjectSelector("GitRepository", domain.namespace, settings.source)
                     cache.annotate(source, asked_at)
@@ -288,10 +287,6 @@ class ReconcileTrigger:
             raise NoAnswer(f"it has neither a kubeconfig nor a {missing}")
 
 
-def _followed(domains: tuple[AccessDomain, ...]) -> list[ObjectSelector]:
+def _followed(domains: tuple[ClusterDomain, ...]) -> list[ObjectSelector]:
     kinds = ("GitRepository", "Kustomization")
     return [ObjectSelector(kind, domain.namespace) for domain in domains for kind in kinds]
-
-
-def _on_cluster(wake: _Wake, domain: AccessDomain) -> ClusterDomain:
-    return ClusterDomain(wake.cluster, domain.name, domain.namespace)

@@ -22,7 +22,6 @@ from demandops.cluster.health import (
     Target,
     health_reader,
     name_of,
-    why_unavailable,
     worst,
 )
 from demandops.cluster.watches import ObjectCache, object_caches
@@ -196,7 +195,6 @@ class ReleaseStatus:
         return self.health.state if self.seen or self.health.object else "unknown"
 
 
-_NO_ACCESS = ReleaseStatus(Health("waiting"))
 # Returns the paths in which two commits differ, if that is known.
 ChangedPaths = Callable[[str, str], "Collection[str] | None"]
 
@@ -206,7 +204,7 @@ def statuses(
     commit: str,
     caches: Mapping[str, ObjectCache],
     history: History,
-    changed: ChangedPaths = lambda seen, commit: None,
+    changed: ChangedPaths,
 ) -> list[ReleaseStatus]:
     changed = cache(changed)
     history = _CachedHistory(history)
@@ -216,7 +214,7 @@ def statuses(
     for target in targets:
         domain = target.domain
         if (store := caches.get(domain.cluster)) is None:
-            results.append(_NO_ACCESS)
+            results.append(ReleaseStatus(Health("waiting")))
             continue
         if domain not in unread:
             unread[domain] = store.unknown_health(domain)
@@ -392,8 +390,8 @@ class RolloutWatcher:
             with suppress(Exception):
                 for domain in rollout.domains:
                     if domain.namespace == namespace:
-                        pods = self._caches[domain.cluster].pods(namespace, deployment)
-                        if reason := why_unavailable(pods):
+                        store = self._caches[domain.cluster]
+                        if reason := store.why_unavailable(namespace, deployment):
                             health = replace(health, reason=f"{health.reason}; {reason}")
                             break
         self._resolve(rollout, health)

@@ -142,19 +142,29 @@ class ObjectCache:
         for selector in wanted:
             self._read(selector)
 
-    def pods(self, namespace: str, deployment: str) -> list[Any]:
+    def why_unavailable(self, namespace: str, deployment: str) -> str:
+        # by its pods, which no watch follows
         from kubernetes import client  # noqa: PLC0415 - slow (half a second), so only on use
 
         item = self.objects().get(("Deployment", namespace, deployment)) or {}
         labels = ((item.get("spec") or {}).get("selector") or {}).get("matchLabels") or {}
         if not labels:  # an empty selector would select all pods of the namespace
-            return []
+            return ""
         listed = client.CoreV1Api(self._api().api_client).list_namespaced_pod(
             namespace,
             label_selector=",".join(f"{key}={value}" for key, value in labels.items()),
             _request_timeout=(CONNECT_S, CONNECT_S),
         )
-        return list(listed.items)
+        for pod in listed.items:
+            for container in pod.status.container_statuses or ():
+                waiting = container.state.waiting if container.state else None
+                if waiting and waiting.reason not in (None, "ContainerCreating"):
+                    message = f": {waiting.message}" if waiting.message else ""
+                    return f"container {container.name}: {waiting.reason}{message}"
+            for reported in pod.status.conditions or ():
+                if reported.type == "PodScheduled" and reported.status == "False":
+                    return f"not scheduled: {reported.message}"
+        return ""
 
     def close(self) -> None:
         self._closed.set()

@@ -9,7 +9,7 @@ from datetime import datetime
 from demandops.base.errors import Fault, Refused, fault, suggestion
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections import connection as routes
-from demandops.connections.connection import Connection, Route
+from demandops.connections.connection import Connection
 from demandops.decide.admission import admission, permission
 from demandops.model.demand.demand import (
     Application,
@@ -269,7 +269,8 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
 
 
 # (words, claims and their topics) for each topic that a shutdown lists; no words: for the subject
-_Listed = Iterator[tuple[str, list[tuple[ClaimKey, set[TopicKey]]]]]
+_Keys = list[tuple[ClaimKey, set[TopicKey]]]
+_Listed = Iterator[tuple[str, _Keys]]
 
 
 def _listed_inputs(listed: Application, claims: list[Claim]) -> _Listed:
@@ -299,56 +300,21 @@ def _listed_routes(listed: Connection, claims: list[Claim]) -> _Listed:
         }
         yield "", [(key, set[TopicKey](topics)) for key, topics in listing.items() if topics]
         return
-    held = [(route, list(_keys_of(route, listed, claims))) for route in listed.topics]
+    held: list[tuple[str, _Keys]] = []
+    for route in listed.topics:
+        named, keys = (route.read_topic, route.written_topic), _Keys()
+        for claim in claims:
+            is_same = claim.subject == listed.subject
+            booked = claim.connection.route(route.source) if is_same else None
+            for other in filter(None, map(claim.connection.route, dict.fromkeys(named))):
+                if booked is None and (other.read_topic, other.written_topic) == named:
+                    booked = other
+            if booked:
+                keys.append((claim.key, {(booked.source,)}))
+        held.append((f"topic {route.source}", keys))
     if not any(keys for _, keys in held) and not any(c.subject == listed.subject for c in claims):
-        yield "", []
-        return
-    for route, keys in held:
-        yield f"topic {route.source}", keys
-
-
-def _keys_of(
-    route: Route, listed: Connection, claims: list[Claim]
-) -> Iterator[tuple[ClaimKey, set[TopicKey]]]:
-    for claim in claims:
-        named = (route.read_topic, route.written_topic)
-        booked = claim.connection.route(route.source) if claim.subject == listed.subject else None
-        for other in filter(None, map(claim.connection.route, dict.fromkeys(named))):
-            if booked is None and (other.read_topic, other.written_topic) == named:
-                booked = other
-        if booked:
-            yield claim.key, {(booked.source,)}
-
-
-def release_demand(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
-    waited = (request.demand,) * (request.demand in ledger.waiting)
-    held = ledger.claims_of_demand(request.demand) if waited else claims_of(ledger, request)
-    after = ledger.without(held).without_waiting(waited)
-    claims = claim_changes(ledger, after, [claim.key for claim in held])
-    return after, Changes(claims=claims, waiting=waited)
-
-
-def renew_leases(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
-    # a demand that waits has no lease yet, but its client may renew it already
-    if request.demand in ledger.waiting and not ledger.claims_of_demand(request.demand):
-        return ledger, Changes()
-    start, held = ledger, claims_of(ledger, request)
-    for claim in held:
-        if claim.lease is not None:
-            renewed = claim.lease.started(now, claim.lease)
-            ledger = ledger.replace(claim.key, replace(claim, lease=renewed))
-    return ledger, Changes(claims=claim_changes(start, ledger, [claim.key for claim in held]))
-
-
-def expire(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
-    held = ledger.claims_of_demand(request.demand)
-    ended = [claim for claim in held if claim.lease and claim.lease.has_ended(now)]
-    readers = [each for each in held if each.is_on_application and each.application.read_outputs]
-    for claim in ended:  # what reads it ends with it, and may be read itself
-        read = claim.subject.id if claim.is_on_application else ""
-        ended += [c for c in readers if read in c.application.read_outputs and c not in ended]
-    after = ledger.without(ended)
-    return after, Changes(claims=claim_changes(ledger, after, [claim.key for claim in ended]))
+        held = [("", [])]
+    yield from held
 
 
 def decommission(  # noqa: PLR0912 - of four kinds
@@ -528,40 +494,59 @@ def request_for(claim: Claim) -> Demand:
 # ---- the way in ----
 
 
-def apply(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
+def apply(  # noqa: PLR0912 - a case for each operation
+    ledger: Ledger, request: Demand, now: datetime
+) -> tuple[Ledger, Changes]:
     """Return the ledger after an admitted request is carried out, and the changes.
 
     If the same request is booked already, at most the leases of its claims change.
     ``docs/demand.md``, "How a demand is booked", says what each operation means.
     """
-    match request.operation:
-        case "join":
-            return join(ledger, request, now)
-        case "shutdown":
-            return shut_down(ledger, request)
-        case "put":
-            return put(ledger, request, now)
-        case "release":
-            return release_demand(ledger, request)
-        case "renew":
-            return renew_leases(ledger, request, now)
-        case "expire":
-            return expire(ledger, request, now)
+    after, demand = ledger, request.demand
+    waited = (demand,) * (demand in ledger.waiting)
     match request:
+        case Demand(operation="join"):
+            return join(ledger, request, now)
+        case Demand(operation="shutdown"):
+            return shut_down(ledger, request)
+        case Demand(operation="put"):
+            return put(ledger, request, now)
         case Decommission():
             return decommission(ledger, request)
-        case Wait():
-            assert request.waiting is not None  # noqa: S101 - the decision sets it
-            waiting = ledger.waiting.insert(request.demand, request.waiting)
-            is_new = ledger.waiting.get(request.demand) != request.waiting
-            changes = Changes(waiting=(request.demand,) * is_new)
-            return replace(ledger, waiting=waiting), changes
-        case Drain():
-            after = ledger
-            for move in request.moves:
-                after = after.replace(move.key, move.after)
-            moved = [move.key for move in request.moves]
-            return after, Changes(claims=claim_changes(ledger, after, moved))
         case Restoration():
             return restore(ledger, request, now)
-    raise TypeError(f"a {request.operation} cannot be applied")
+        case Demand(operation="release"):
+            held = ledger.claims_of_demand(demand) if waited else claims_of(ledger, request)
+            after, keys = ledger.without(held).without_waiting(waited), [c.key for c in held]
+            return after, Changes(claims=claim_changes(ledger, after, keys), waiting=waited)
+        case Demand(operation="renew"):
+            # a demand that waits has no lease yet, but its client may renew it already
+            if waited and not ledger.claims_of_demand(demand):
+                return ledger, Changes()
+            held = claims_of(ledger, request)
+            keys = [claim.key for claim in held]
+            for claim in held:
+                if claim.lease is not None:
+                    renewed = claim.lease.started(now, claim.lease)
+                    after = after.replace(claim.key, replace(claim, lease=renewed))
+        case Demand(operation="expire"):
+            held = ledger.claims_of_demand(demand)
+            ended = [claim for claim in held if claim.lease and claim.lease.has_ended(now)]
+            readers = [c for c in held if c.is_on_application and c.application.read_outputs]
+            for claim in ended:  # what reads it ends with it, and may be read itself
+                read = claim.subject.id if claim.is_on_application else ""
+                more = [c for c in readers if read in c.application.read_outputs]
+                ended += [c for c in more if c not in ended]
+            after, keys = ledger.without(ended), [claim.key for claim in ended]
+        case Wait():
+            assert request.waiting is not None  # noqa: S101 - the decision sets it
+            waiting = ledger.waiting.insert(demand, request.waiting)
+            is_new = ledger.waiting.get(demand) != request.waiting
+            return replace(ledger, waiting=waiting), Changes(waiting=(demand,) * is_new)
+        case Drain():
+            keys = [move.key for move in request.moves]
+            for move in request.moves:
+                after = after.replace(move.key, move.after)
+        case _:
+            raise TypeError(f"a {request.operation} cannot be applied")
+    return after, Changes(claims=claim_changes(ledger, after, keys))

@@ -6,9 +6,9 @@ whenever it is shown, and is stored nowhere.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quantities import amount_text
@@ -26,6 +26,7 @@ _LEFT_OUT = ("demands", "suspended", "nodes", "waiting", "targets", "listed")
 # Topic → the requesters of the topic, sorted.
 _Requesters: TypeAlias = dict[str, list[str]]
 Json: TypeAlias = dict[str, Any]
+Kind = Literal["service", "connection"]
 
 
 def bookkeeping(world: World) -> Json:
@@ -54,21 +55,58 @@ def bookkeeping(world: World) -> Json:
     ]
     waiting = [
         {
-            "demand": demand.demand,
-            "requesters": list(demand.requesters),
-            "since": demand.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
-            "priority": demand.put.priority,
+            "demand": each.demand,
+            "requesters": list(each.requesters),
+            "since": each.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            "priority": each.put.priority,
         }
-        for demand in in_turn(world.ledger.waiting)
+        for each in in_turn(world.ledger.waiting)
     ]
+    by_demand: dict[str, list[Claim]] = {}
+    subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
+    for claim in (claim for subject in subjects for claim in world.ledger.claims_on(subject)):
+        if claim.keeping_override is None:  # a claim that an override keeps is of no demand
+            by_demand.setdefault(claim.demand, []).append(claim)
+    # also those whose claims are suspended, but no service or connection counts these claims
+    demands: dict[str, Json] = {}
+    for demand, held in sorted(by_demand.items()):
+        demands[demand] = {
+            # the ROS action that takes such a demand
+            "action": "DeploymentRequest" if held[0].joined else "Demand",
+            "request": held[0].request,
+            "requesters": list(requesters_of(held)),
+        }
+        # applications that it does not list, each with those that read its outputs
+        held_for = {
+            claim.subject.id: list(claim.application.held_for)
+            for claim in held
+            if claim.is_on_application and claim.application.held_for
+        }
+        if held_for:
+            demands[demand]["held_for"] = held_for
+    # of those that declare a capacity, what services request of each resource, and the capacity
+    usage, config, nodes = whole_usage(world), world.config, dict[str, dict[str, Json]]()
+    # A machine that is in several access domains is one entry, because it has one capacity.
+    machines = {id: node for id, node in config.nodes.items() if id not in config.hosts}
+    for id, node in sorted(machines.items()):
+        names = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
+        limits = ((name, node.most(name)) for name in sorted(names))
+        resources = {
+            name: {
+                "requested": amount_text(usage.of(id, name), name),
+                "capacity": amount_text(most, name),
+            }
+            for name, most in limits
+            if most is not None
+        }
+        if resources:
+            nodes[id] = resources
     return {
         "services": dict(sorted(services.items())),  # by release name
         "connections": connections,
-        # also those whose claims are suspended, but no service or connection counts these claims
-        "demands": _demands(world),
+        "demands": demands,
         "suspended": suspended,
-        # of those that declare a capacity, what services request of each resource, and the capacity
-        "nodes": _nodes(world),
+        "nodes": nodes,
         "waiting": waiting,  # in the order of the tries to book
     }
 
@@ -129,52 +167,6 @@ def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[st
     return {version: sorted(requesters) for version, requesters in sorted(asking.items())}
 
 
-def _demands(world: World) -> dict[str, Json]:
-    by_demand: dict[str, list[Claim]] = {}
-    subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
-    for claim in (claim for subject in subjects for claim in world.ledger.claims_on(subject)):
-        if claim.keeping_override is None:  # a claim that an override keeps is of no demand
-            by_demand.setdefault(claim.demand, []).append(claim)
-    demands: dict[str, Json] = {}
-    for demand, claims in sorted(by_demand.items()):
-        demands[demand] = {
-            # the ROS action that takes such a demand
-            "action": "DeploymentRequest" if claims[0].joined else "Demand",
-            "request": claims[0].request,
-            "requesters": list(requesters_of(claims)),
-        }
-        # applications that it does not list, each with those that read its outputs
-        held_for = {
-            claim.subject.id: list(claim.application.held_for)
-            for claim in claims
-            if claim.is_on_application and claim.application.held_for
-        }
-        if held_for:
-            demands[demand]["held_for"] = held_for
-    return demands
-
-
-def _nodes(world: World) -> dict[str, dict[str, Json]]:
-    usage, config = whole_usage(world), world.config
-    nodes: dict[str, dict[str, Json]] = {}
-    # A machine that is in several access domains is one entry, because it has one capacity.
-    machines = {id: node for id, node in config.nodes.items() if id not in config.hosts}
-    for id, node in sorted(machines.items()):
-        names = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
-        limits = ((name, node.most(name)) for name in sorted(names))
-        resources = {
-            name: {
-                "requested": amount_text(usage.of(id, name), name),
-                "capacity": amount_text(most, name),
-            }
-            for name, most in limits
-            if most is not None
-        }
-        if resources:
-            nodes[id] = resources
-    return nodes
-
-
 def _sorted(topics: dict[str, set[str]]) -> _Requesters:
     return {topic: sorted(who) for topic, who in topics.items()}
 
@@ -201,7 +193,7 @@ def as_data(view: Json, commit: str) -> Json:
 
 @dataclass(frozen=True, slots=True)
 class EntryChange:
-    kind: Literal["service", "connection"]
+    kind: Kind
     name: str
     change: Literal["added", "changed", "removed"]
     requesters: list[str]  # the last ones
@@ -209,26 +201,21 @@ class EntryChange:
     gained: tuple[str, ...] = ()
 
 
-def _changes(
-    kind: Literal["service", "connection"], old: Mapping[str, Json], new: Mapping[str, Json]
-) -> Iterator[EntryChange]:
-    for name in sorted({*old, *new}):
-        if name not in new:
-            yield EntryChange(kind, name, "removed", old[name]["requesters"])
-        elif name not in old:
-            yield EntryChange(kind, name, "added", new[name]["requesters"])
-        elif old[name] != new[name]:
-            had, has = list(_facts(old[name], new[name])), list(_facts(new[name], old[name]))
-            lost = tuple(fact for fact in had if fact not in has)
-            gained = tuple(fact for fact in has if fact not in had)
-            yield EntryChange(kind, name, "changed", new[name]["requesters"], lost, gained)
-
-
 def bookkeeping_changes(old: Json, new: Json) -> tuple[EntryChange, ...]:
-    return (
-        *_changes("service", old["services"], new["services"]),
-        *_changes("connection", old["connections"], new["connections"]),
-    )
+    changes, kinds = list[EntryChange](), get_args(Kind)
+    for kind, was, now in ((kind, old[f"{kind}s"], new[f"{kind}s"]) for kind in kinds):
+        for name in sorted({*was, *now}):
+            if name not in now:
+                changes.append(EntryChange(kind, name, "removed", was[name]["requesters"]))
+            elif name not in was:
+                changes.append(EntryChange(kind, name, "added", now[name]["requesters"]))
+            elif was[name] != now[name]:
+                had, has = list(_facts(was[name], now[name])), list(_facts(now[name], was[name]))
+                lost = tuple(fact for fact in had if fact not in has)
+                gained = tuple(fact for fact in has if fact not in had)
+                who = now[name]["requesters"]
+                changes.append(EntryChange(kind, name, "changed", who, lost, gained))
+    return tuple(changes)
 
 
 def _facts(entry: Json, other: Json) -> Iterator[str]:

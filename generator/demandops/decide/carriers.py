@@ -106,34 +106,26 @@ class _StandingRoutes:
         others = bringing if not exact else ()
         for holders in ([each for each in bringing if each.demand == demand], exact, others):
             found = []
-            for claim, route in self._bringing(holders, same):
-                key, is_own = claim.connection.key_of(route), claim.demand == demand
-                was_listed = is_own and not route.implied
-                # from another node, only an earlier goal of the demand itself brings it
-                if key.sender != same.sender and not (is_join and was_listed):
-                    continue
-                if key.topic != same.topic and ("." in flow.name or flow.delivery is not None):
-                    continue
-                # a put gives up what it listed and lists no longer
-                if key.topic != same.topic and was_listed and not is_join:
-                    continue
-                found.append((key != same, claim.subject.id, claim, route))
+            for claim in filter(None, map(self.ledger.get, sorted(holders, key=_ORDER))):
+                if claim.key not in self._by_target:
+                    by_target = self._by_target[claim.key] = {}
+                    for route in claim.connection.topics:
+                        by_target.setdefault(claim.connection.key_of(route)[2:], []).append(route)
+                for route in self._by_target[claim.key].get(same[2:], ()):
+                    key = claim.connection.key_of(route)
+                    was_listed = claim.demand == demand and not route.implied
+                    # from another node, only an earlier goal of the demand itself brings it
+                    if key.sender != same.sender and not (is_join and was_listed):
+                        continue
+                    # a put gives up what it listed and lists no longer
+                    by_name = "." in flow.name or flow.delivery is not None
+                    if key.topic != same.topic and (by_name or (was_listed and not is_join)):
+                        continue
+                    found.append((key != same, claim.subject.id, claim, route))
             if found:
                 *_, claim, route = min(found, key=lambda each: each[:2])
                 return claim, route
         return None
-
-    def _bringing(
-        self, holders: Iterable[ClaimKey], same: RouteKey
-    ) -> Iterator[tuple[Claim, Route]]:
-        for claim in filter(None, map(self.ledger.get, sorted(holders, key=_ORDER))):
-            if claim.key not in self._by_target:
-                routes: dict[tuple[str, ...], list[Route]] = {}
-                for route in claim.connection.topics:
-                    routes.setdefault(claim.connection.key_of(route)[2:], []).append(route)
-                self._by_target[claim.key] = routes
-            for route in self._by_target[claim.key].get(same[2:], ()):
-                yield claim, route
 
 
 # ---- carriers: each route of a demand gets its connection ----
@@ -227,7 +219,15 @@ class _Carriers:
             booked_route = replace(current, implied=True, listed="")
         else:
             booked_route = replace(route, listed=listed.id if is_elsewhere else "")
-        booked_route = _turned(booked_route, key, header, current)
+        # from the source of its carrier to the target, or back
+        turned = (key.topic, key.target, False)
+        if header.source == header.target:
+            same = current or booked_route
+            turned = (same.source, same.target, same.reverse)
+        elif header.source != key.sender:
+            turned = (key.target, key.topic, True)
+        source, target, reverse = turned
+        booked_route = replace(booked_route, source=source, target=target, reverse=reverse)
         differs = _difference(listed, header, self._config)
         if is_elsewhere or differs:
             what = f" of connection '{listed.id}'" if item.is_listed else ""
@@ -297,18 +297,6 @@ class _Carriers:
             )
 
 
-def _turned(route: Route, key: RouteKey, carrier: Connection, current: Route | None) -> Route:
-    """Return the route from the source of its carrier to the target, or back."""
-    if carrier.source == carrier.target:
-        turned = current or route
-        names = (turned.source, turned.target, turned.reverse)
-    elif carrier.source == key.sender:
-        names = (key.topic, key.target, False)
-    else:
-        names = (key.target, key.topic, True)
-    return replace(route, source=names[0], target=names[1], reverse=names[2])
-
-
 def _difference(listed: Connection, carrier: Connection, config: Config) -> str:
     kind = carrier.type
     if kind is None or listed.type not in (None, kind):
@@ -319,15 +307,6 @@ def _difference(listed: Connection, carrier: Connection, config: Config) -> str:
 
 
 # ---- a connection that does not suit the others ----
-
-
-def doubled(connection: Connection, ledger: Ledger) -> Iterator[tuple[int, str]]:
-    """Yield (index, id of the other connection) for each route that another one carries too."""
-    for index, route in enumerate(connection.topics):
-        holders = ledger.keys_with("route", *connection.key_of(route))
-        others = {key.subject.id for key in holders} - {connection.id}
-        if others:
-            yield index, min(others)
 
 
 def brought_twice(connection: Connection, ledger: Ledger) -> Iterator[tuple[int, str]]:

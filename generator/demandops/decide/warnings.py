@@ -13,14 +13,13 @@ from itertools import combinations, groupby, islice
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, suggestion
-from demandops.base.quantities import amount_of
+from demandops.base.quantities import amount_of, amount_text
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, needed_access
 from demandops.decide.booking import Drain
 from demandops.decide.checks.collisions import Names, publishers, topics_made
 from demandops.decide.placement.candidates import lacks, requirement_of, unmet
-from demandops.decide.placement.capacity import overcommitted
 from demandops.decide.placement.relocation import following_overrides, with_moves
 from demandops.decide.planning.flows import flows_without_carrier, topics_of_origin
 from demandops.decide.planning.overrides import without_suspended
@@ -373,13 +372,17 @@ def policy_warnings(world: State) -> Iterator[Fault]:
     config = world.config
     yield from _open_by_host_network(config)
     yield from _connections_no_longer_allowed(world)
-    for node, excess in overcommitted(world, world.usage()):
-        message = (
-            f"{excess}; these services stay on the node, but no demand gets more of this resource "
-            "there; raise the capacity, or move something to another node"
-        )
-        file = config.file_of(NODES_FILE, node.id)
-        yield fault("", f"'{node.id}': {message}").within(file)
+    for (id, resource), used in sorted(world.usage().amounts.items()):
+        node = config.nodes.get(id)
+        most = node.most(resource) if node else None
+        if most is not None and used > most:
+            message = (
+                f"'{id}': services request {amount_text(used, resource)} {resource}, but the node "
+                f"has {amount_text(most, resource)}; these services stay on the node, but no "
+                "demand gets more of this resource there; raise the capacity, or move something "
+                "to another node"
+            )
+            yield fault("", message).within(config.file_of(NODES_FILE, id))
     for id in config.drained_nodes:
         if world.ledger.applications_on.get(id):
             drain = with_moves(Drain(id=id), world, world.usage(), world.names())

@@ -321,6 +321,8 @@ class EventEngine:
                 case Hours() as hours:
                     self.hours.append((rule, hours))
         self.areas = {name: AreaGrid(areas[name]) for name in file.sources}
+        # of the step that is made
+        self._state, self._events = State(0.0, -inf, 0.0, 0.0), list[Event]()
 
     def start(self, now: float, held: Iterable[Key] = (), settle_s: float = 0.0) -> State:
         """Return the state with which the engine starts.
@@ -335,10 +337,17 @@ class EventEngine:
             rule = self.rules.get(name)
             if rule is not None and isinstance(rule.condition, Count):
                 settle = max(settle, self.timeouts[rule.sources[0]])
-        step = EngineStep(self, State(now, due=-inf, settled=now + settle, hours_due=now))
+        self._state = State(now, due=-inf, settled=now + settle, hours_due=now)
+        # Events that started before a restart; those that no rule is for are ignored.
         for key in keys:
-            step.resume(key, settle_s)
-        return step.state
+            rule = self.rules.get(key[0])
+            if rule is None or len(rule.subjects) != len(key[1]) or not rule.is_for(key[1]):
+                continue
+            self._enter(key, rule, Phase(now, lasts=True))
+            for who in rule.entities_of(key[1]):
+                # A source that reports seldom may not have reported yet when the detector settles.
+                self._state.awaited[who] = now + max(settle_s, self.timeouts[who[0]])
+        return self._state
 
     def step(
         self, state: State, observations: Iterable[Observation], now: float
@@ -349,108 +358,87 @@ class EventEngine:
         lacks is left out. One earlier than ``state.now`` counts as made then, and one later than
         ``now`` as made at ``now``.
         """
-        step = EngineStep(self, state)
+        self._state, self._events = state.copied(), []
         for observation in observations:
             if observation.source in self.timeouts:
-                step.pass_time(min(observation.at, now))
-                step.observe(observation)
-        step.pass_time(now)
-        return step.state, tuple(step.events)
-
-
-# ---- one step of the engine, which changes a copy of the state ----
-
-
-class EngineStep:
-    def __init__(self, engine: EventEngine, state: State) -> None:
-        self._engine, self.state = engine, state.copied()
-        self.events: list[Event] = []
-
-    def resume(self, key: Key, settle_s: float) -> None:
-        # An event that started before a restart; one that no rule is for is ignored.
-        rule = self._engine.rules.get(key[0])
-        if rule is not None and len(rule.subjects) == len(key[1]) and rule.is_for(key[1]):
-            self._enter(key, rule, Phase(self.state.now, lasts=True))
-            for who in rule.entities_of(key[1]):
-                # A source that reports seldom may not have reported yet when the detector settles.
-                wait_s = max(settle_s, self._engine.timeouts[who[0]])
-                self.state.awaited[who] = self.state.now + wait_s
+                self._pass_time(min(observation.at, now))
+                self._observe(observation)
+        self._pass_time(now)
+        return self._state, tuple(self._events)
 
     # ---- time ----
 
-    def pass_time(self, until: float) -> None:
-        while until >= self.state.due:
-            self.state.due = inf
+    def _pass_time(self, until: float) -> None:
+        while until >= self._state.due:
+            self._state.due = inf
             # In the order of their times, so a long silence gives the same events as short ones.
             for at, act in sorted(self._all_due(), key=lambda due: due[0]):
                 # an action may have made another change due before
-                if at > min(until, self.state.due):
+                if at > min(until, self._state.due):
                     break
-                self.state.now = max(self.state.now, at)
+                self._state.now = max(self._state.now, at)
                 act()
-            self.state.due = min((at for at, _ in self._all_due()), default=inf)
-        self.state.now = max(self.state.now, until)
+            self._state.due = min((at for at, _ in self._all_due()), default=inf)
+        self._state.now = max(self._state.now, until)
 
     def _all_due(self) -> Iterator[tuple[float, Callable[[], None]]]:
-        for key, phase in self.state.phases.items():
+        for key, phase in self._state.phases.items():
             if not phase.lasts:
-                at = phase.since + self._engine.rules[key[0]].dwell_s
+                at = phase.since + self.rules[key[0]].dwell_s
                 yield at, partial(self._end_dwell, key, phase)
-        if self._engine.hours:
-            yield self.state.hours_due, self._look_at_hours
-        if self.state.now < self.state.settled:
-            for rule in self._engine.rules.values():
+        if self.hours:
+            yield self._state.hours_due, self._look_at_hours
+        if self._state.now < self._state.settled:
+            for rule in self.rules.values():
                 if isinstance(rule.condition, Count):
-                    yield self.state.settled, partial(self._count, rule.name, 0)
-        timeouts = self._engine.timeouts
-        for who, last in self.state.seen.items():
+                    yield self._state.settled, partial(self._count, rule.name, 0)
+        timeouts = self.timeouts
+        for who, last in self._state.seen.items():
             yield last.at + timeouts[last.source], partial(self._lose_silent, who, last)
-        for who, until in self.state.awaited.items():
+        for who, until in self._state.awaited.items():
             yield until, partial(self._lose_awaited, who)
 
     def _end_dwell(self, key: Key, phase: Phase) -> None:
         # An action before this one may have ended the phase, or begun another.
-        if self.state.phases.get(key) is phase:
-            self._begin(key, self._engine.rules[key[0]])
+        if self._state.phases.get(key) is phase:
+            self._begin(key, self.rules[key[0]])
 
     def _look_at_hours(self) -> None:
-        for rule, hours in self._engine.hours:
-            is_on = hours.is_on(self.state.now)
+        for rule, hours in self.hours:
+            is_on = hours.is_on(self._state.now)
             self._latch((rule.name, ()), rule, is_on, not is_on)
-        self.state.hours_due = min(
-            hours.next_check(self.state.now) for _, hours in self._engine.hours
-        )
-        self.state.due = min(self.state.due, self.state.hours_due)
+        self._state.hours_due = min(hours.next_check(self._state.now) for _, hours in self.hours)
+        self._state.due = min(self._state.due, self._state.hours_due)
 
     def _lose_silent(self, who: Who, last: Observation) -> None:
-        if self.state.seen.get(who) is last:
-            self._lose(who, f"{who[1]} has been silent for {self._engine.timeouts[who[0]]:g} s")
+        if self._state.seen.get(who) is last:
+            self._lose(who, f"{who[1]} has been silent for {self.timeouts[who[0]]:g} s")
 
     def _lose_awaited(self, who: Who) -> None:
-        if self.state.awaited.pop(who, None) is not None:
+        if self._state.awaited.pop(who, None) is not None:
             self._lose(who, f"{who[1]} has not been seen since the start")
 
     def _lose(self, who: Who, why: str) -> None:
-        last = self.state.seen.pop(who, None)
-        for key in sorted(self.state.engaged.get(who, ())):
-            self._leave(key, self._engine.rules[key[0]], why)
-        for name in sorted(self.state.counted.pop(who, ())):
+        last = self._state.seen.pop(who, None)
+        for key in sorted(self._state.engaged.get(who, ())):
+            self._leave(key, self.rules[key[0]], why)
+        for name in sorted(self._state.counted.pop(who, ())):
             self._count(name, -1)
-        for pair in self._engine.pairs[who[0]]:
+        for pair in self.pairs[who[0]]:
             if pair.rule.takes(who):
-                pair.move(self.state.cells, who[1], last, None)
+                pair.move(self._state.cells, who[1], last, None)
 
     # ---- observations ----
 
-    def observe(self, observation: Observation) -> None:  # noqa: PLR0912
-        if observation.at != self.state.now:
-            observation = observation._replace(at=self.state.now)
+    def _observe(self, observation: Observation) -> None:  # noqa: PLR0912
+        if observation.at != self._state.now:
+            observation = observation._replace(at=self._state.now)
         who, source, entity = observation.who, observation.source, observation.entity
-        before = self.state.seen.get(who)
-        self.state.seen[who] = observation
-        self.state.awaited.pop(who, None)
-        self.state.due = min(self.state.due, observation.at + self._engine.timeouts[source])
-        for rule, limits in self._engine.thresholds[source]:
+        before = self._state.seen.get(who)
+        self._state.seen[who] = observation
+        self._state.awaited.pop(who, None)
+        self._state.due = min(self._state.due, observation.at + self.timeouts[source])
+        for rule, limits in self.thresholds[source]:
             value = observation.values.get(limits.field)
             if value is not None and rule.takes(who):
                 is_past, is_back = limits.is_past(value), limits.is_back(value)
@@ -459,7 +447,7 @@ class EngineStep:
             return
         x, y = observation.position
         compared, counted = set[str](), set[str]()
-        for rule, area in self._engine.areas[source].at(x, y):
+        for rule, area in self.areas[source].at(x, y):
             if not rule.takes(who):
                 continue
             away = area.distance(x, y)
@@ -469,87 +457,87 @@ class EngineStep:
             elif away <= area.radius:
                 counted.add(rule.name)
         # The index does not yield the areas that the entity has left, so their events end here.
-        for key in sorted(self.state.engaged.get(who, ())):
-            left = self._engine.rules[key[0]]
+        for key in sorted(self._state.engaged.get(who, ())):
+            left = self.rules[key[0]]
             if isinstance(left.condition, Near) and key[0] not in compared:
                 self._latch(key, left, False, True)
-        counted_before = self.state.counted.get(who, frozenset())
+        counted_before = self._state.counted.get(who, frozenset())
         if counted != counted_before:
-            self.state.counted[who] = frozenset(counted)
+            self._state.counted[who] = frozenset(counted)
             for name in sorted(counted ^ counted_before):
                 self._count(name, 1 if name in counted else -1)
-        for pairs in self._engine.pairs[source]:
+        for pairs in self.pairs[source]:
             if pairs.rule.takes(who):
-                pairs.move(self.state.cells, entity, before, observation)
+                pairs.move(self._state.cells, entity, before, observation)
                 self._compare_with_others(pairs, observation)
 
     def _compare_with_others(self, pairs: Pairs, observation: Observation) -> None:
         who, compared = observation.who, set[Key]()
         rule, limits = pairs.rule, pairs.condition
-        for other in sorted(pairs.around(self.state.cells, observation)):
-            key, away = pairs.key(who, other), distance(observation, self.state.seen[other])
+        for other in sorted(pairs.around(self._state.cells, observation)):
+            key, away = pairs.key(who, other), distance(observation, self._state.seen[other])
             compared.add(key)
             self._latch(key, rule, away <= limits.start, away > limits.stop)
         # The squares around do not have the partners that are far away, so their events end here. A
         # partner that is still awaited after a restart has no position yet.
-        for key in sorted(self.state.engaged.get(who, ())):
+        for key in sorted(self._state.engaged.get(who, ())):
             is_left = key[0] == rule.name and key not in compared
-            if is_left and all(entity in self.state.seen for entity in rule.entities_of(key[1])):
+            if is_left and all(entity in self._state.seen for entity in rule.entities_of(key[1])):
                 self._latch(key, rule, False, True)
 
     def _count(self, name: str, change: int) -> None:
-        rule = self._engine.rules[name]
-        count = self.state.counts[name] = self.state.counts.get(name, 0) + change
+        rule = self.rules[name]
+        count = self._state.counts[name] = self._state.counts.get(name, 0) + change
         if isinstance(limits := rule.condition, Count):
-            stops = count <= limits.stop and self.state.now >= self.state.settled
+            stops = count <= limits.stop and self._state.now >= self._state.settled
             self._latch((name, ()), rule, count >= limits.start, stops)
 
     # ---- events ----
 
     def _latch(self, key: Key, rule: Rule, starts: bool, stops: bool) -> None:
-        phase = self.state.phases.get(key)
+        phase = self._state.phases.get(key)
         if stops and phase is not None:
             self._leave(key, rule, "")
         elif starts and phase is None:
             if rule.dwell_s:
-                self._enter(key, rule, Phase(self.state.now, lasts=False))
-                self.state.due = min(self.state.due, self.state.now + rule.dwell_s)
+                self._enter(key, rule, Phase(self._state.now, lasts=False))
+                self._state.due = min(self._state.due, self._state.now + rule.dwell_s)
             else:
                 self._begin(key, rule)
 
     def _begin(self, key: Key, rule: Rule) -> None:
-        self._enter(key, rule, Phase(self.state.now, lasts=True))
+        self._enter(key, rule, Phase(self._state.now, lasts=True))
         self._report(key, rule, True, "")
 
     def _enter(self, key: Key, rule: Rule, phase: Phase) -> None:
-        self.state.phases[key] = phase
+        self._state.phases[key] = phase
         for who in rule.entities_of(key[1]):
-            self.state.engaged[who] = self.state.engaged.get(who, frozenset()) | {key}
+            self._state.engaged[who] = self._state.engaged.get(who, frozenset()) | {key}
 
     def _leave(self, key: Key, rule: Rule, why: str) -> None:
-        phase = self.state.phases.pop(key)
+        phase = self._state.phases.pop(key)
         for who in rule.entities_of(key[1]):
-            self.state.engaged[who] -= {key}
-            if not self.state.engaged[who]:
-                del self.state.engaged[who]
+            self._state.engaged[who] -= {key}
+            if not self._state.engaged[who]:
+                del self._state.engaged[who]
         if phase.lasts:
             self._report(key, rule, False, why)
 
     def _report(self, key: Key, rule: Rule, starts: bool, why: str) -> None:
         if why:
-            self.events.append(Event(*key, starts, self.state.now, why))
+            self._events.append(Event(*key, starts, self._state.now, why))
             return
         subjects = key[1]
         values: dict[str, str | float] = {"rule": rule.name}
         values |= dict(zip(rule.subjects, subjects, strict=True))
-        entities = [self.state.seen[who] for who in rule.entities_of(subjects)]
+        entities = [self._state.seen[who] for who in rule.entities_of(subjects)]
         x, y = (entities[0].position if entities else None) or (0.0, 0.0)
         match rule.condition:
             case Threshold(field=field):
                 values["value"] = value = entities[0].values.get(field, 0.0)
                 why = f"{field} of {subjects[0]} is {value:g}"
             case Count():
-                values["count"] = count = self.state.counts.get(rule.name, 0)
+                values["count"] = count = self._state.counts.get(rule.name, 0)
                 why = f"{count} entities are in or near the area"
             case Near() as area:
                 values |= {"x": x, "y": y, "distance": (away := area.distance(x, y))}
@@ -559,4 +547,4 @@ class EngineStep:
                 why = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
             case Hours():
                 why = "the hours of the schedule"
-        self.events.append(Event(*key, starts, self.state.now, why, values))
+        self._events.append(Event(*key, starts, self._state.now, why, values))

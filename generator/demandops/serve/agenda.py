@@ -388,14 +388,11 @@ class Backoff:
         self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
         wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
         self._away = FIRST_TURN_S
-        return self._jittered(wait)
+        return wait * self._runtime.uniform(0.5, 1.0)
 
     def unreachable(self) -> float:
         wait, self._away = self._away, min(self._away * 2, LONGEST_AWAY_S)
-        return self._jittered(wait)
-
-    def _jittered(self, seconds: float) -> float:
-        return seconds * self._runtime.uniform(0.5, 1.0)
+        return wait * self._runtime.uniform(0.5, 1.0)
 
 
 # ---- the budget of one decision, because other demands wait meanwhile ----
@@ -465,10 +462,8 @@ class RateLimit:
         recent.setdefault(operation, received)  # one that is evaluated again keeps its number
         self._seen[key] = recent  # at the end, so that the requester that is idle longest is first
         # forget requesters that sent nothing for a minute, because vehicles come and go
-        idlest = next(iter(self._seen))
-        while all(abs(received - at) > _WINDOW for at in self._seen[idlest].values()):
-            del self._seen[idlest]
-            idlest = next(iter(self._seen))
+        while all(abs(received - at) > _WINDOW for at in next(iter(self._seen.values())).values()):
+            self._seen.pop(next(iter(self._seen)))
         return list(recent).index(operation) + 1
 
 

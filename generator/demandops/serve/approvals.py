@@ -168,7 +168,11 @@ class Approvals:
             if branch in self.proposals:
                 self._demands.fail([ticket], _belongs_to_another(branch))
                 return
-            replaces = next((old.record.as_replaced() for old in replaced), "")
+            replaces = ""
+            if replaced:
+                was = replaced[0].record
+                # nobody has seen one without a commit, so the one that it replaces still counts
+                replaces = f"{was.branch} {was.commits[-1]}" if was.commits else was.replaces
             proposal = Proposal(ProposalRecord(branch, replaces=replaces), searched_to=ticket.base)
         if not self._demands.propose(ticket, proposal.record):
             self._demands.fail([ticket], errors.Withdrawn(TAKEN_BACK))
@@ -227,7 +231,12 @@ class Approvals:
                 break
             self._repository.while_waiting()
             try:
-                if not proposal.is_unchanged(str(snapshot.commit), heads.branches):
+                is_unchanged = (
+                    proposal.checked_at == str(snapshot.commit)
+                    and all(ticket.state == "proposed" for ticket in proposal.tickets)
+                    and heads.branches.get(proposal.branch) in proposal.record.commits[-1:]
+                )
+                if not is_unchanged:
                     self._check(proposal, snapshot, heads)
                     proposal.refused_from = None
             except BranchMoved as error:

@@ -84,10 +84,6 @@ class ProposalRecord:
     def replaced_branch(self) -> str:
         return self.replaces.partition(" ")[0]
 
-    def as_replaced(self) -> str:
-        # nobody has seen a proposal without a commit, so the one that it replaces still counts
-        return f"{self.branch} {self.commits[-1]}" if self.commits else self.replaces
-
 
 @dataclass(eq=False)
 class Ticket:

@@ -11,7 +11,7 @@ import json
 import logging
 import re
 from collections import deque
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeAlias
@@ -71,11 +71,6 @@ class Proposal:
     @property
     def waits(self) -> bool:
         return any(ticket.state == "proposed" for ticket in self.tickets)
-
-    def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
-        head = branches.get(self.branch)
-        all_wait = all(ticket.state == "proposed" for ticket in self.tickets)
-        return all_wait and self.checked_at == tip and head in self.record.commits[-1:]
 
     def verdict(
         self,

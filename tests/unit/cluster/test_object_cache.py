@@ -63,7 +63,8 @@ def store(api: Api) -> ObjectCache:
 
 def test_one_object_is_asked_for_by_its_name(api: Api) -> None:
     read = store(api)
-    assert read.pods("perception", "mqtt-edge") == [], "of a Deployment that is not known"
+    why = read.why_unavailable("perception", "mqtt-edge")
+    assert why == "", "of a Deployment that is not known"
     read.read_once([OVER, CHILDREN])
     over, children = api.asked
     assert over.endswith(

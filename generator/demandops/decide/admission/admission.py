@@ -23,13 +23,7 @@ from demandops.model.config.config import (
     VERSIONS_FILE,
     Config,
 )
-from demandops.model.demand.demand import (
-    LONGEST_S,
-    Application,
-    Connect,
-    Delivery,
-    Demand,
-)
+from demandops.model.demand.demand import LONGEST_S, Application, Connect, Delivery, Demand
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
 
@@ -84,8 +78,7 @@ def _application_faults(app: Application, config: Config, claiming: bool) -> Ite
     if claiming or app.node:
         yield from _id_faults("node", app.node)
     for where, topic in inputs:
-        problem = topic_problem(topic.topic)
-        if problem:
+        if problem := topic_problem(topic.topic):
             yield fault(f"{where}.topic", problem)
         if claiming or topic.source:
             yield from _id_faults(f"{where}.source", topic.source)
@@ -136,8 +129,7 @@ def _delivery_faults(where: str, delivery: Delivery, services: Services) -> Iter
             f"{name} may make several topics, so a delivery cannot rename them; leave 'topic' out"
         )
         yield fault(f"{where}.topic", message)
-    problem = topic_problem(delivery.topic) if delivery.topic else ""
-    if problem:
+    if delivery.topic and (problem := topic_problem(delivery.topic)):
         yield fault(f"{where}.topic", problem)
 
 
@@ -264,8 +256,7 @@ def _node_faults(where: str, node: str, config: Config) -> Iterator[Fault]:
 
 
 def _id_faults(where: str, value: str) -> Iterator[Fault]:
-    problem = id_problem(value)
-    if problem:
+    if problem := id_problem(value):
         yield fault(where, problem)
 
 

@@ -128,40 +128,34 @@ def with_chosen_domains(
     if not config.hosts:
         return request, []
     faults: list[Fault] = []
-    demanded = []
-    for item in request.demanded:
-        held = _with_short_names(item.held, config)
-        booked = ledger.first_claim(held.subject)
-        booked_nodes = _named(booked.held) if booked else {}
-        chosen = _chosen(item, booked_nodes, config, request.adds_claims, faults)
-        nodes = {**_named(held), **dict(chosen)}
-        if isinstance(held, Application):
-            services = {name: nodes[f"services.{name}"] for name in held.services}
-            held = replace(held, node=nodes["node"], services=services)
-        else:
-            held = replace(held, source=nodes["source"], target=nodes["target"])
-        demanded.append(replace(item, held=held))
-    return replace(request, demanded=tuple(demanded)), faults
 
-
-def _with_short_names(held: Held, config: Config) -> Held:
     # so that a node has one name in claims: <node>@<first domain> is the same node as <node>
     def short(name: str) -> str:
         node, _, domain = name.rpartition("@")
         own = config.domain_of.get(node)
         return node if own and name not in config.nodes and own.name == domain else name
 
-    if isinstance(held, Connection):
-        source, target, broker = map(short, (held.source, held.target, held.broker))
-        return replace(held, source=source, target=target, broker=broker)
-    inputs = {
-        role: tuple(replace(topic, source=short(topic.source)) for topic in topics)
-        for role, topics in held.inputs.items()
-    }
-    deliver = tuple(replace(each, node=short(each.node)) for each in held.deliver)
-    services = {name: short(node) for name, node in held.services.items()}
-    held = replace(held, node=short(held.node), services=services, deliver=deliver)
-    return held.with_inputs(inputs)
+    demanded = []
+    for item in request.demanded:
+        held = item.held
+        booked = ledger.first_claim(held.subject)
+        booked_nodes = _named(booked.held) if booked else {}
+        nodes = {field: short(node) for field, node in _named(held).items()}
+        nodes |= _chosen(item, booked_nodes, config, request.adds_claims, faults)
+        if isinstance(held, Connection):
+            source, target, broker = nodes["source"], nodes["target"], short(held.broker)
+            held = replace(held, source=source, target=target, broker=broker)
+        else:
+            inputs = {
+                role: tuple(replace(topic, source=short(topic.source)) for topic in topics)
+                for role, topics in held.inputs.items()
+            }
+            deliver = tuple(replace(each, node=short(each.node)) for each in held.deliver)
+            services = {name: nodes[f"services.{name}"] for name in held.services}
+            held = replace(held, node=nodes["node"], services=services, deliver=deliver)
+            held = held.with_inputs(inputs)
+        demanded.append(replace(item, held=held))
+    return replace(request, demanded=tuple(demanded)), faults
 
 
 def _named(held: Held) -> dict[str, str]:

@@ -143,9 +143,8 @@ def stranger_faults(
     # ``homes`` are the nodes of the demand's claims; None if it waits for one
     owners, asking = {*owners}, {*request.requesters()}
     # the generator itself ends leases, and names nobody
-    if request.operation not in ("put", "release", "renew", "wait") or asking == owners:
-        return
-    if not owners:
+    changes_one = request.operation in ("put", "release", "renew", "wait")
+    if not changes_one or not owners or asking == owners:
         return
 
     def managed_in(domain: AccessDomain) -> set[str]:

@@ -76,14 +76,14 @@ def faults_of_claim(claim: Claim, before: World, after: World, names: Names) -> 
     keys = keys_of_claims(after, [claim])
     for clash in topic_faults(request_for(claim), before, after, keys, names):
         yield clash.within(path_of(claim.key))
-    for index, other in (
-        () if claim.is_on_application else carriers.doubled(claim.connection, after.ledger)
-    ):
-        message = (
-            f"connection '{other}' carries this topic between the same nodes already; remove it "
-            "from one of the two"
-        )
-        yield fault(f"topics[{index}]", message, code="conflict").within(path_of(claim.key))
+    for index, route in () if claim.is_on_application else enumerate(claim.connection.topics):
+        holders = after.ledger.keys_with("route", *claim.connection.key_of(route))
+        if others := {key.subject.id for key in holders} - {claim.subject.id}:
+            message = (
+                f"connection '{min(others)}' carries this topic between the same nodes already; "
+                "remove it from one of the two"
+            )
+            yield fault(f"topics[{index}]", message, code="conflict").within(path_of(claim.key))
 
 
 def _clashes_of_service(

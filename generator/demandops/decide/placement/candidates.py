@@ -148,7 +148,7 @@ class Choice:
         order = self.config.repo_settings.placement
         skipped: dict[str, None] = {}
         for node in sorted(fitting, key=rank):
-            if self._is_full(node):
+            if any(self._excesses(node)):
                 skipped["that have room"] = None
                 continue
             if not self._is_permitted(node):
@@ -172,7 +172,7 @@ class Choice:
 
     def has_room(self, node: str) -> bool:
         entry = self.config.nodes.get(node)
-        return entry is not None and self.fits(node) and not self._is_full(entry)
+        return entry is not None and self.fits(node) and not any(self._excesses(entry))
 
     def take(self, node: str) -> None:
         """Add the application or service to the load of a node, as later choices see it."""
@@ -207,10 +207,11 @@ class Choice:
                 growth[host, resource] = growth.get((host, resource), 0) + amount
         return growth
 
-    def _is_full(self, node: Node) -> bool:
-        if node.capacity is None or node.id in self.room.given_back:
-            return False
-        return any(capacity.excesses(self.room.usage, self._growth(node.id), self.config))
+    def _excesses(self, node: Node) -> Iterator[str]:
+        if node.capacity is not None and node.id not in self.room.given_back:
+            growth = self._growth(node.id)
+            for _, excess in capacity.excesses(self.room.usage, growth, self.config):
+                yield excess
 
     def _shortage(self, node: Node) -> list[str]:
         """Return, in words, each resource of which a node has too little; empty if it has room."""
@@ -218,10 +219,7 @@ class Choice:
         if refusal is not None:
             full = refusal.full if isinstance(refusal, NoRoom) else {}
             return full.get(self.config.host_of(node.id), [])
-        if not self._is_full(node):
-            return []
-        growth, config = self._growth(node.id), self.config
-        return [excess for _, excess in capacity.excesses(self.room.usage, growth, config)]
+        return [*self._excesses(node)]
 
     def _fitting(self) -> list[Node]:
         required, config = self.requirement, self.config
@@ -280,8 +278,9 @@ class Choice:
 
     def none_fits(self) -> Fault:
         """Return the fault if no node fits: why, beginning with the nodes that nearly fit."""
+        where, what = ("type", f"{self.service.name}: ") if self.service else ("place", "")
         if unknown := next(unmet(self.requirement, self.config), ""):
-            return self._fault(unknown, "no-node")
+            return self.item.fault(where, what + unknown, code="no-node")
         rank, codes = self._rank(), set[str]()
         misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
         places = {self.config.place_of(NODES_FILE): None}
@@ -308,15 +307,11 @@ class Choice:
         shown = [text for *_, text in nsmallest(_MOST_SHOWN, misses)]
         hidden = len(misses) - len(shown)
         more = [f"{hidden} more {'are' if hidden > 1 else 'is'} not shown"] if hidden else []
-        message = f"no node fits: {'; '.join([*shown, *more]) or 'the inventory has no node'}"
+        message = f"{what}no node fits: {'; '.join([*shown, *more]) or 'the inventory has no node'}"
         less = f"change 'place' in {self.service.file}" if self.service else "ask for less"
         message += f"; {less}, or ask for a change of {' or '.join(places)}"
-        return self._fault(message, NO_ROOM if codes == {NO_ROOM} else "no-node")
-
-    def _fault(self, message: str, code: str) -> Fault:
-        if self.service is None:
-            return self.item.fault("place", message, code=code)
-        return self.item.fault("type", f"{self.service.name}: {message}", code=code)
+        code = NO_ROOM if codes == {NO_ROOM} else "no-node"
+        return self.item.fault(where, message, code=code)
 
 
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:

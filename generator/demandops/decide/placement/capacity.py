@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from rpds import HashTrieMap
@@ -19,7 +20,6 @@ from demandops.decide.planning import release_keys
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.config import NODES_FILE, Config
-from demandops.model.config.inventory import Node
 from demandops.model.ledger.ledger import ClaimChange, World
 from demandops.model.release import Release, ServiceRelease, most_replicas
 
@@ -72,12 +72,10 @@ def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> di
 
 
 def _plan_leniently(world: World, keys: Iterable[ReleaseKey]) -> Plans:
-    planned: dict[ReleaseKey, Release | None] = {}
-    for key in keys:
-        try:
+    planned: dict[ReleaseKey, Release | None] = dict.fromkeys(keys)
+    for key in planned:
+        with suppress(Refused):  # a release that cannot be planned requests nothing
             planned[key] = plan(world, key)
-        except Refused:  # a release that cannot be planned requests nothing
-            planned[key] = None
     return planned
 
 
@@ -125,12 +123,3 @@ def refuse_excess(usage: Usage, grown: Mapping[Need, int], config: Config) -> No
     refusal = NoRoom(usage, grown, config)
     if refusal.full:
         raise refusal
-
-
-def overcommitted(world: World, usage: Usage) -> Iterator[tuple[Node, str]]:
-    for (id, resource), used in sorted(usage.amounts.items()):
-        node = world.config.nodes.get(id)
-        most = node.most(resource) if node else None
-        if node and most is not None and used > most:
-            used_text, most_text = amount_text(used, resource), amount_text(most, resource)
-            yield node, f"services request {used_text} {resource}, but the node has {most_text}"

@@ -30,7 +30,7 @@ from demandops.decide.placement.candidates import (
 from demandops.decide.placement.capacity import NoRoom, Usage
 from demandops.decide.state import State
 from demandops.model.config.appdef import Service
-from demandops.model.demand.demand import Application, Demand, Item, Requirement
+from demandops.model.demand.demand import Application, Demand, Item
 from demandops.model.demand.goals import items_of
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World
@@ -144,15 +144,41 @@ class _Places(Generic[_Result]):
         comes later. Services come after all applications, because a service runs on its
         application's node if it can.
         """
+        positions = self._request.positions
         for index, item in enumerate(self._demanded):
-            if isinstance(item.held, Application) and item.held.place is not None:
+            if not isinstance(item.held, Application) or (place := item.held.place) is None:
+                continue
+            with self._faults_noted():
+                choice = Choice(item, place, self._room, None, positions)
+                if not item.held.node:
+                    self._take(index, choice, _booked(choice, self._request.demand))
+                    continue
+                # ``node`` and ``place`` together are a check of the named node, and no preference.
+                node = choice.config.nodes.get(item.held.node)
+                # admission reports an unknown node
+                if node and (lacking := list(lacks(node, place))):
+                    message = (
+                        f"{quoted(node.id)} lacks {joined(lacking)}; name another node, or leave "
+                        "out one of the fields 'node' and 'place'"
+                    )
+                    raise Refused([item.fault("place", message, code="no-node")])
+                self._demanded[index] = replace(item, held=replace(item.held, place=None))
+        for index, item in enumerate(self._demanded):
+            if not isinstance(item.held, Application) or not item.held.node:
+                continue
+            for service in self._services_left(index, item, item.held):
                 with self._faults_noted():
-                    self._place_application(index, item, item.held, item.held.place)
-        for index, item in enumerate(self._demanded):
-            if isinstance(item.held, Application) and item.held.node:
-                for service in self._services_left(index, item, item.held):
-                    with self._faults_noted():
-                        self._place_service(index, service)
+                    so_far, required = self._demanded[index], requirement_of(service)
+                    choice = Choice(so_far, required, self._room, service, positions)
+                    first = self._booked_as(choice.app)
+                    here = first.services.get(service.name, "") if first else ""
+                    shared = _shared_node(choice.app, service, self._state)
+                    chosen = None
+                    if here and (here == shared or choice.fits(here)):
+                        chosen = Chosen(here, "where it is booked already")
+                    elif shared and choice.has_room(shared):
+                        chosen = Chosen(shared, "where the service already runs for this topic")
+                    self._take(index, choice, chosen)
         return replace(self._request, demanded=tuple(self._demanded)), self._faults
 
     @contextmanager
@@ -182,24 +208,6 @@ class _Places(Generic[_Result]):
         if self._last and self._last[0] == request.demanded:
             return self._last[1]
         return self._tried(request.demanded)
-
-    def _place_application(
-        self, index: int, item: Item, app: Application, place: Requirement
-    ) -> None:
-        choice = Choice(item, place, self._room, None, self._request.positions)
-        if app.node:
-            # ``node`` and ``place`` together are a check of the named node, and no preference.
-            node = choice.config.nodes.get(app.node)
-            # admission reports an unknown node
-            if node and (lacking := list(lacks(node, place))):
-                message = (
-                    f"{quoted(app.node)} lacks {joined(lacking)}; name another node, or leave out "
-                    "one of the fields 'node' and 'place'"
-                )
-                raise Refused([item.fault("place", message, code="no-node")])
-            self._demanded[index] = replace(item, held=replace(app, place=None))
-            return
-        self._take(index, choice, _booked(choice, self._request.demand))
 
     def _services_left(self, index: int, item: Item, app: Application) -> list[Service]:
         """Return the services that still need a node; those that are named or booked get theirs."""
@@ -250,19 +258,6 @@ class _Places(Generic[_Result]):
     def _booked_as(self, app: Application) -> Application | None:
         booked = self._state.ledger.application(app.id)
         return booked if booked and booked.appdef == app.appdef else None
-
-    def _place_service(self, index: int, service: Service) -> None:
-        item, positions = self._demanded[index], self._request.positions
-        choice = Choice(item, requirement_of(service), self._room, service, positions)
-        first = self._booked_as(choice.app)
-        here = first.services.get(service.name, "") if first else ""
-        shared = _shared_node(choice.app, service, self._state)
-        chosen = None
-        if here and (here == shared or choice.fits(here)):
-            chosen = Chosen(here, "where it is booked already")
-        elif shared and choice.has_room(shared):
-            chosen = Chosen(shared, "where the service already runs for this topic")
-        self._take(index, choice, chosen)
 
     def _take(self, index: int, choice: Choice, chosen: Chosen | None) -> None:
         """Put the application or service on ``chosen``, or else on the first node that will do."""

@@ -102,7 +102,18 @@ def with_moves(
             if at == node and name in definitions
         ]
         for service in leaving:
-            ids = _moving_with(id, service, node, world)
+            ids = [id]
+            now = world.ledger.application(id)
+            if now and service and service.scope == "topic":
+                # They share the instances of the service on the node. If only some moved, the
+                # application's node would get the same outputs from two nodes.
+                ids = [
+                    each
+                    for each in applications_of(world.ledger, node)
+                    if (other := world.ledger.application(each))
+                    and other.services.get(service.name) == node
+                    and candidates.shares(service, now, other)
+                ]
             claims = tuple(claim for id in ids for claim in world.ledger.application_claims(id))
             what = [f"application '{id}'" for id in ids]
             what = [f"service '{service.name}' of {text}" for text in what] if service else what
@@ -111,7 +122,17 @@ def with_moves(
             if fixed := next(filter(None, (_why_fixed(c, node, service) for c in claims)), ""):
                 stays.append(f"{what[0]} stays, because {fixed}")
                 continue
-            choice = _choice_for(world, claims, service, usage)
+            # another node is chosen by what all the claims require and read
+            apps = [claim.application for claim in claims]
+            places = (app.place or Requirement() for app in apps)
+            own = candidates.requirement_of(service) if service else None
+            required = own or reduce(Requirement.united, places)
+            inputs: dict[str, dict[InputTopic, None]] = {}
+            for role, topics in (each for app in apps for each in app.inputs.items()):
+                inputs.setdefault(role, {}).update(dict.fromkeys(topics))
+            united = apps[0].with_inputs({role: (*topics,) for role, topics in inputs.items()})
+            item = Item(united, requesters_of(claims))
+            choice = Choice(item, required, Room(world, usage), service)
             try:
                 chosen, moving = choice.first(partial(_moved, world, names, usage, claims, service))
             except Refused as refusal:
@@ -127,22 +148,6 @@ def with_moves(
         last = ""
     moves = claim_changes(start.ledger, world.ledger, keys)
     return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays), last=last)
-
-
-def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
-    app = world.ledger.application(id)
-    if service is None or service.scope != "topic" or app is None:
-        return [id]
-    # They share the instances of the service on the node. If only some moved, the application's
-    # node would get the same outputs from two nodes.
-    others = {each: world.ledger.application(each) for each in applications_of(world.ledger, node)}
-    return [
-        each
-        for each, other in others.items()
-        if other
-        and other.services.get(service.name) == node
-        and candidates.shares(service, app, other)
-    ]
 
 
 def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
@@ -163,20 +168,6 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
         return []
     apps = ((id, ledger.application(id)) for id in ledger.ids_with("node", node))
     return [id for id, app in apps if app and node in app.chosen_nodes]
-
-
-def _choice_for(
-    world: World, claims: tuple[Claim, ...], service: Service | None, usage: Usage
-) -> Choice:
-    """Return the choice of another node, by what all the claims require and read."""
-    places = (claim.application.place or Requirement() for claim in claims)
-    required = candidates.requirement_of(service) if service else reduce(Requirement.united, places)
-    inputs: dict[str, dict[InputTopic, None]] = {}
-    for claim in claims:
-        for role, topics in claim.application.inputs.items():
-            inputs.setdefault(role, {}).update(dict.fromkeys(topics))
-    app = claims[0].application.with_inputs({role: (*topics,) for role, topics in inputs.items()})
-    return Choice(Item(app, requesters_of(claims)), required, Room(world, usage), service)
 
 
 def _moved(

@@ -55,14 +55,10 @@ def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | 
 
 
 def _unshaped(world: World, key: ReleaseKey) -> Release | None:
-    if isinstance(key, ServiceKey):
-        return _service(world, key)
-    return key.type.client(key, _ClaimedConnections(world, key.type), world.config)
-
-
-def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
-    config, claims = world.config, release_keys.claims_needing(world, key)
-    if not claims:
+    config = world.config
+    if not isinstance(key, ServiceKey):
+        return key.type.client(key, _ClaimedConnections(world, key.type), config)
+    if not (claims := release_keys.claims_needing(world, key)):
         return None
     apps = [claim.application for claim in claims]
     first = world.ledger.application(apps[0].id) or apps[0]
@@ -234,8 +230,7 @@ class _ClaimedConnections:
         united = replace(first, broker=next(filter(None, brokers), ""), topics=topics)
         # A person may have written a claim with a route that this type cannot carry, or have
         # removed from the inventory what the connection needs.
-        problems = list(route_faults(self.type, united, self.world.config))
-        if problems:
+        if problems := list(route_faults(self.type, united, self.world.config)):
             raise Refused(
                 replace(problem, field="connections", message=f"'{id}': {problem.message}")
                 for problem in problems

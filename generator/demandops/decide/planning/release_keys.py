@@ -87,11 +87,8 @@ ReleaseKey = ServiceKey | ClientKey
 
 
 def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
-    """Yield the keys of the releases that the unsuspended claims on ``subject`` need.
-
-    If the definition of the application is missing, nothing is yielded. With ``strict``, this
-    raises ``Refused`` instead, so that no service ends because its definition was deleted.
-    """
+    # With ``strict``, a missing definition raises Refused, so that no service ends because its
+    # definition was deleted; else nothing is yielded for it.
     world = without_suspended(world)
     yield from keys_of_claims(world, world.ledger.claims_on(subject), strict=strict)
 
