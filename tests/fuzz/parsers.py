@@ -19,7 +19,7 @@ from application_manager_interfaces.action import DeploymentRequest
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.cli import target
-from demandops.cli.changes.override import ends_at
+from demandops.cli.changes.configure import ends_at
 from demandops.cluster.health import ClusterDomain, ObjectSelector, health_reader
 from demandops.cluster.health import Target as ReleaseTarget
 from demandops.decide.state import try_configuration

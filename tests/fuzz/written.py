@@ -20,7 +20,7 @@ import yaml
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.base.naming import Subject, SubjectKind, topic_problem
-from demandops.cli.changes.override import override_text, selector
+from demandops.cli.changes.configure import override_text, selector
 from demandops.decide.state import try_configuration
 from demandops.model.config.base_model import parse_file
 from demandops.model.config.load import load

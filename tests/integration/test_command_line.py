@@ -17,7 +17,7 @@ import pygit2
 import pytest
 import yaml
 from demandops.base.errors import Unsound
-from demandops.cli.queries import diff
+from demandops.cli.queries import commits
 
 from tests.integration.conftest import On
 from tests.kit.cli import Ran, Run
@@ -256,7 +256,7 @@ def test_a_fault_of_the_program_or_its_machine_has_a_code_of_its_own(
     def broken(*args: object) -> None:
         raise error
 
-    monkeypatch.setattr(diff, "derive", broken)
+    monkeypatch.setattr(commits, "derive", broken)
     ran = on("bookkeeping")
     assert (ran.code, ran.out) == (3, "")
     assert ran.err.startswith(told)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import yaml
 from demandops.base import naming
-from demandops.cli.changes.override import name_of
+from demandops.cli.changes.configure import name_of
 
 from tests.integration.conftest import On
 from tests.kit.dialogue import CTRL_C, Dialogue

@@ -15,7 +15,7 @@ import click
 import demandops
 import pytest
 from demandops.cli import main
-from demandops.cli.queries.log import OPERATIONS
+from demandops.cli.queries.commits import OPERATIONS
 from demandops.model.demand.demand import Operation
 
 PRINT_THIRD_PARTY = """
@@ -37,11 +37,16 @@ def test_help_and_version_import_click_alone(option: str) -> None:
     assert option == "--version" or all(name in "\n".join(shown) for name in main.COMMANDS)
 
 
-@pytest.mark.parametrize("name", main.COMMANDS)
-def test_a_short_help_is_the_first_sentence_of_the_help_and_fits_a_terminal(name: str) -> None:
-    module, short_help = main.COMMANDS[name]
+def skip_without_ros(name: str) -> None:
+    module = next(module for module, names in main.MODULES.items() if name in names.split())
     if module.startswith("demandops_ros"):
         pytest.importorskip("rclpy")
+
+
+@pytest.mark.parametrize("name", main.COMMANDS)
+def test_a_short_help_is_the_first_sentence_of_the_help_and_fits_a_terminal(name: str) -> None:
+    skip_without_ros(name)
+    short_help = main.COMMANDS[name]
     command = main.load(name)
     assert command.name == name
     assert command.get_short_help_str(limit=1000) == short_help
@@ -66,8 +71,7 @@ def examples_of(command: click.Command) -> list[list[str]]:
 def test_every_command_has_examples_that_parse(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    if main.COMMANDS[name][0].startswith("demandops_ros"):
-        pytest.importorskip("rclpy")
+    skip_without_ros(name)
     monkeypatch.setenv("DEMANDOPS_STATE_REPO", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     for path, command in commands_of(main.load(name), name):
@@ -92,7 +96,8 @@ def parse(command: click.Command, words: list[str], parent: click.Context | None
     [
         (["serve"], "rclpy", ("demandops_ros.", "rclpy."), "see README.md, 'With ROS 2'"),
         (["diff", "a", "b"], "difflib",
-         ("demandops.cli.queries.diff", "demandops.decide.changeset"), "install demandops again"),
+         ("demandops.cli.queries.commits", "demandops.decide.changeset"),
+         "install demandops again"),
     ],
 )  # fmt: skip
 def test_a_command_whose_package_is_missing_says_so(

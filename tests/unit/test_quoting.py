@@ -16,8 +16,7 @@ from demandops.base.quoting import is_visible, json_escaped, one_line
 from demandops.base.strict_yaml import located_in
 from demandops.cli import output
 from demandops.cli.authoring import check
-from demandops.cli.json_output import print_json, show
-from demandops.cli.table import Table
+from demandops.cli.formats import Table, print_json, show
 from demandops.model.config.base_model import parse_file
 from demandops.model.ledger.records import _WaitingFile
 from demandops.views.rows import Column

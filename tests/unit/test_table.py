@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from demandops.cli.table import Table
+from demandops.cli.formats import Table
 from demandops.views.rows import Column
 from hypothesis import given
 from hypothesis import strategies as st

@@ -25,59 +25,63 @@ from demandops.base.quoting import OneLineFormatter, one_line
 from demandops.cli.output import OutputLost, done, errors, open_streams, show_slow
 from demandops.repo.git import child_processes
 
-# The package of each command's module, and the short help, which `--help` shows without importing
-# the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.
+# The short help of each command, which `--help` shows without importing its module.
 COMMANDS = {
-    "approve": ("changes.approve", "Approve a proposal: merge its branch in your own name."),
-    "bookkeeping": ("queries.diff", "Show who requests which service and connection."),
-    "check": ("authoring.check", "Check edits of a state repo and show their consequences."),
-    "completion": ("program", "Print the completion script for a shell."),
-    "config": ("program", "List, set and choose contexts: the fleets that you work with."),
-    "decommission": ("changes.ledger_change", "Release all claims of a node or a requester."),
-    "demand": ("changes.demand", "Demand what files ask for: book it, or send it to a node."),
-    "detect": (
-        "demandops_ros.detector.detect_command",
-        "Watch topics, and send the demands that rules ask for.",
-    ),
-    "diff": ("queries.diff", "Show the differences between two commits."),
-    "drain": ("changes.edit", "Take a node out of use: nothing new is placed there."),
-    "get": ("queries.get", "List demands, releases, nodes, overrides and so on."),
-    "init": ("state_repo", "Create a state repo."),
-    "journal": ("state_repo", "List the accepted demands that are not published."),
-    "log": ("queries.log", "List the commits of the state repo, newest first."),
-    "may": ("queries.why", "Say whether a requester may demand an application, and why."),
-    "new": ("authoring.new", "Write a new application or image."),
-    "override": ("changes.override", "Create and end overrides: deviations that people declare."),
-    "parameter-sync": (
-        "demandops_ros.parameter_sync",
-        "Keep a ROS node's parameters equal to those in a ConfigMap.",
-    ),
-    "release": (
-        "changes.ledger_change",
-        "Stop one demand, or an application for all who demand it.",
-    ),
-    "reconcile": (
-        "queries.status",
-        "Let Flux or Argo CD fetch now, and not at its next interval.",
-    ),
-    "reject": ("changes.approve", "Reject a proposal: delete its branch, and record who and why."),
-    "resume": ("changes.override", "Run suspended applications and connections again."),
-    "revert": ("changes.edit", "Undo a person's commit, by a new commit."),
-    "rollback": (
-        "changes.ledger_change",
-        "Restore the claims of an earlier commit, by a new commit.",
-    ),
-    "schema": ("authoring.schema", "Print the JSON Schema of a kind of file."),
-    "serve": ("demandops_ros.serve_command", "Run the ROS 2 node that accepts demands."),
-    "status": ("queries.status", "Show the state of each release on its cluster."),
-    "suspend": ("changes.override", "Stop applications and connections; their claims stay booked."),
-    "undrain": ("changes.edit", "Use a drained node again."),
-    "upgrade": ("state_repo", "Render everything again, in one commit."),
-    "verify": ("state_repo", "Render commits again from their ledger and compare the bytes."),
-    "version": ("program", "Print the versions of the program and of its formats."),
-    "watch": ("queries.live", "Show releases, demands and the latest commits live."),
-    "web": ("queries.live", "Show the state repo on a web page."),
-    "why": ("queries.why", "Explain why something runs or ran, and who decided it."),
+    "approve": "Approve a proposal: merge its branch in your own name.",
+    "bookkeeping": "Show who requests which service and connection.",
+    "check": "Check edits of a state repo and show their consequences.",
+    "completion": "Print the completion script for a shell.",
+    "config": "List, set and choose contexts: the fleets that you work with.",
+    "decommission": "Release all claims of a node or a requester.",
+    "demand": "Demand what files ask for: book it, or send it to a node.",
+    "detect": "Watch topics, and send the demands that rules ask for.",
+    "diff": "Show the differences between two commits.",
+    "drain": "Take a node out of use: nothing new is placed there.",
+    "get": "List demands, releases, nodes, overrides and so on.",
+    "init": "Create a state repo.",
+    "journal": "List the accepted demands that are not published.",
+    "log": "List the commits of the state repo, newest first.",
+    "may": "Say whether a requester may demand an application, and why.",
+    "new": "Write a new application or image.",
+    "override": "Create and end overrides: deviations that people declare.",
+    "parameter-sync": "Keep a ROS node's parameters equal to those in a ConfigMap.",
+    "release": "Stop one demand, or an application for all who demand it.",
+    "reconcile": "Let Flux or Argo CD fetch now, and not at its next interval.",
+    "reject": "Reject a proposal: delete its branch, and record who and why.",
+    "resume": "Run suspended applications and connections again.",
+    "revert": "Undo a person's commit, by a new commit.",
+    "rollback": "Restore the claims of an earlier commit, by a new commit.",
+    "schema": "Print the JSON Schema of a kind of file.",
+    "serve": "Run the ROS 2 node that accepts demands.",
+    "status": "Show the state of each release on its cluster.",
+    "suspend": "Stop applications and connections; their claims stay booked.",
+    "undrain": "Use a drained node again.",
+    "upgrade": "Render everything again, in one commit.",
+    "verify": "Render commits again from their ledger and compare the bytes.",
+    "version": "Print the versions of the program and of its formats.",
+    "watch": "Show releases, demands and the latest commits live.",
+    "web": "Show the state repo on a web page.",
+    "why": "Explain why something runs or ran, and who decided it.",
+}
+
+# The commands of each module, which is below `demandops.cli`, except in `demandops_ros`.
+MODULES = {
+    "authoring.check": "check",
+    "authoring.new": "new",
+    "authoring.schema": "schema",
+    "changes.configure": "drain override resume revert suspend undrain",
+    "changes.demand": "demand",
+    "changes.ledger_change": "decommission release rollback",
+    "changes.person_change": "approve reject",
+    "demandops_ros.detector.detect_command": "detect",
+    "demandops_ros.parameter_sync": "parameter-sync",
+    "demandops_ros.serve_command": "serve",
+    "program": "completion config version",
+    "queries.commits": "bookkeeping diff log",
+    "queries.get": "get",
+    "queries.status": "reconcile status watch web",
+    "queries.why": "may why",
+    "state_repo": "init journal upgrade verify",
 }
 
 # Other names of commands.
@@ -129,7 +133,7 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    module = COMMANDS[name][0]
+    module = next(module for module, names in MODULES.items() if name in names.split())
     ros = module.startswith("demandops_ros.")
     found = imported(name, module if ros else f"demandops.cli.{module}")
     command: click.Command = getattr(found, name.replace("-", "_"))
@@ -180,7 +184,7 @@ class _LazyGroup(click.Group):
 
 @click.group(
     cls=_LazyGroup,
-    commands=[click.Command(name, short_help=text) for name, (_, text) in COMMANDS.items()],
+    commands=[click.Command(name, short_help=text) for name, text in COMMANDS.items()],
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.version_option(__version__, prog_name="demandops")

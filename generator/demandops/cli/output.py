@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-    from demandops.repo.load.snapshot import Snapshot
-    from demandops.repo.reader import Reader
-
 _MOST_LISTED = 3
 
 Progress = Callable[[int, int], None]
@@ -136,21 +133,6 @@ class _Errors:
 
 
 errors = _Errors()
-
-
-def warn_of_problems(repo: Reader, snapshot: Snapshot) -> None:
-    for problem in repo.problems_of(snapshot):
-        errors.print(f"warning: not in effect: {problem}")
-    if snapshot.faults:
-        errors.print(f"warning: {in_effect(repo, snapshot)}")
-
-
-def in_effect(repo: Reader, snapshot: Snapshot) -> str:
-    """Tell which configuration is in effect instead of the newest, and how to change that."""
-    return (
-        f"the configuration of commit {str(snapshot.configuration)[:10]} stays in effect until a "
-        f"commit is valid; {repo.how_to_mend(snapshot)}"
-    )
 
 
 def warn_of_not_rendered(paths: Collection[str]) -> None:

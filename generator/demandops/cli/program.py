@@ -14,9 +14,8 @@ from demandops import __version__
 from demandops.base import settings
 from demandops.base.runtime import REAL
 from demandops.cli import target
-from demandops.cli.json_output import output_option, show
+from demandops.cli.formats import output_option, show, table_of
 from demandops.cli.output import print_lines
-from demandops.cli.table import table_of
 from demandops.cli.target import context_names
 from demandops.model.config.base_model import parse
 from demandops.views.rows import Column

@@ -14,7 +14,7 @@ from demandops.base.errors import StateRepoError, fault
 from demandops.base.runtime import REAL
 from demandops.cli import target
 from demandops.cli.authoring import schema
-from demandops.cli.json_output import output_option, show
+from demandops.cli.formats import output_option, show
 from demandops.cli.output import busy, done, errors, progress
 from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader
@@ -202,31 +202,27 @@ def upgrade(
             done.extend([f"upgraded in {result.commit}"] if result.files else [])
     old, new = result.old.repo_settings, result.new.repo_settings
     outcome = "unchanged" if not result.files else "would-change" if dry_run else "upgraded"
-    data = {
+    data: Json = {
         "outcome": outcome,
         "commit": result.commit,
         "render_version": {"from": old.render_version, "to": new.render_version},
         "gitops": {"from": old.gitops, "to": new.gitops},
         "written": [path for path, text in result.files.items() if text is not None],
         "removed": [path for path, text in result.files.items() if text is None],
-        "after": _steps_after(result),
+        "after": [
+            {
+                "cluster": cluster,
+                "what": "apply the cluster's bootstrap file again, because the file changed",
+                "commands": [f"git show main:{path} | kubectl apply -f -"],
+            }
+            for cluster in domains_by_cluster(result.new)
+            if (path := bootstrap_path(cluster)) in result.files
+        ],
     }
-    show(output, data, _upgrade_lines(result, dry_run))
+    show(output, data, _upgrade_lines(result, data["after"], dry_run))
 
 
-def _steps_after(result: Upgrade) -> list[Json]:
-    return [
-        {
-            "cluster": cluster,
-            "what": "apply the cluster's bootstrap file again, because the file changed",
-            "commands": [f"git show main:{path} | kubectl apply -f -"],
-        }
-        for cluster in domains_by_cluster(result.new)
-        if (path := bootstrap_path(cluster)) in result.files
-    ]
-
-
-def _upgrade_lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
+def _upgrade_lines(result: Upgrade, steps: list[Json], dry_run: bool) -> Iterator[str]:
     old, new = result.old.repo_settings, result.new.repo_settings
     if not result.files:
         yield (
@@ -251,7 +247,7 @@ def _upgrade_lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
         yield f"  and {len(result.files) - _MOST_PATHS} more (--output json lists all)"
     if result.switches:
         yield f"\n{_SWITCH}"
-    if steps := _steps_after(result):
+    if steps:
         yield "\nafter the upgrade, on the clusters:"
     for step in steps:
         yield f"- {step['cluster']}: {step['what']}"
@@ -325,6 +321,9 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
 
 # ---- ``demandops journal``: accepted demands that are yet to be published ----
 
+# How long a running generator is waited for, which gives up a demand.
+_DROP_S = 15.0
+
 
 @click.command()
 @target.writable_repo_option
@@ -358,7 +357,19 @@ def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> 
     """
     folder = settings.data_home(state_repo)
     if drop is not None:
-        _drop(folder, drop, output)
+        request, end = drop_demand(folder, drop), REAL.monotonic() + _DROP_S
+        while request and request.exists() and REAL.monotonic() < end:
+            REAL.sleep(0.1)
+        outcome = "dropped" if not request else "requested" if request.exists() else "answered"
+        text = {
+            "dropped": "is given up; if its generator died after the push, it is booked, which "
+            "`demandops log` shows",
+            "answered": "has its answer from the generator that runs, whose log has it too",
+            "requested": "is given up by the generator that runs as soon as the state repo shows "
+            "that no push of it has arrived",
+        }
+        data = {"operation_id": drop, "outcome": outcome}
+        show(output, data, [f"demand {drop} {text[outcome]}"])
         return
     journals = list(find_journals(folder, REAL.now(), set_aside=set_aside))
     rows, lines = [], []
@@ -389,22 +400,3 @@ def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> 
     show(output, rows, [*lines, f"{number} {what} accepted and not published"])
     if any(each.damage and not each.set_aside for each in journals):
         raise click.exceptions.Exit(1)
-
-
-_DROP_S = 15.0
-
-
-def _drop(folder: Path, operation: str, output: str) -> None:
-    request, end = drop_demand(folder, operation), REAL.monotonic() + _DROP_S
-    while request and request.exists() and REAL.monotonic() < end:
-        REAL.sleep(0.1)
-    outcome = "dropped" if not request else "requested" if request.exists() else "answered"
-    text = {
-        "dropped": "is given up; if its generator died after the push, it is booked, which "
-        "`demandops log` shows",
-        "answered": "has its answer from the generator that runs, whose log has it too",
-        "requested": "is given up by the generator that runs as soon as the state repo shows that "
-        "no push of it has arrived",
-    }
-    data = {"operation_id": operation, "outcome": outcome}
-    show(output, data, [f"demand {operation} {text[outcome]}"])

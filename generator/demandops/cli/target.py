@@ -188,9 +188,10 @@ _context_option = click.option(
 )
 
 
-def _state_repo(
-    default: Callable[[], str | None], where: str, *, required: bool = True
-) -> Callable[[Command], Command]:
+def _state_repo(*, writes: bool = True, required: bool = True) -> Callable[[Command], Command]:
+    default = partial(_default_repo, writes=writes)
+    where = f"{'the remote of ' if writes else ''}the checkout that you are in"
+
     def address(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
         from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT
         path = Path(value or "")
@@ -224,20 +225,14 @@ def _state_repo(
 
 
 # The option `--state-repo` of a command that only reads; it may name a checkout.
-state_repo_option = _state_repo(_default_repo, "the checkout that you are in")
+state_repo_option = _state_repo(writes=False)
 
 # The option `--state-repo` of a command that writes.
 # If the checkout has no remote, the default with `--dry-run` is the checkout itself.
-writable_repo_option = _state_repo(
-    partial(_default_repo, writes=True), "the remote of the checkout that you are in"
-)
+writable_repo_option = _state_repo()
 
 # The same of a command that can also do without: then it is empty.
-optional_repo_option = _state_repo(
-    partial(_default_repo, writes=True),
-    "the remote of the checkout that you are in",
-    required=False,
-)
+optional_repo_option = _state_repo(required=False)
 
 dry_run_option = click.option(
     "--dry-run",

@@ -237,8 +237,7 @@ def planned_releases(world: World) -> dict[ReleaseKey, Release]:
     releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(world):
         with suppress(InvalidInput):
-            release = plan(world, key)
-            if release is not None:
+            if release := plan(world, key):
                 releases[key] = release
     return releases
 
@@ -252,8 +251,7 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
     errors: list[tuple[ReleaseKey, InvalidInput]] = []
     for key in all_keys(world):
         try:
-            release = plan(world, key)
-            if release is not None:
+            if release := plan(world, key):
                 gitops.render(release, world.config, evaluate)
         except InvalidInput as error:
             errors.append((key, error))

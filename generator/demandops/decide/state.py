@@ -95,8 +95,7 @@ def rendered_files(
     files = gitops.base_files(config)
     collisions.refuse_shared_names(state, keys)  # one would overwrite the file of the other
     for key in keys:
-        release = plan(state, key)
-        if release is None:
+        if (release := plan(state, key)) is None:
             continue
         path = gitops.path_of(release)
         try:

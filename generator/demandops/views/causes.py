@@ -25,7 +25,6 @@ KINDS: dict[str, str] = {
     **dict.fromkeys(("unread", "failing", "invalid", "suspended"), "bad"),
     **dict.fromkeys(("decision", "waiting", "starting"), "busy"),
 }
-_PLACES = {kind: place for place, kind in enumerate(KINDS)}
 
 # What kubelet and the scheduler write into a pod's status, which the reason of a release quotes.
 _IMAGE = re.compile(r"ImagePull|ErrImage|InvalidImage|manifest unknown|pull access denied", re.I)
@@ -74,13 +73,9 @@ class Cause:
 
 def causes(source: Source) -> list[Cause]:
     """Return every cause, the worst kind first, then the oldest."""
-    every = [
-        *_unread_or_invalid(source),
-        *_denied(source),
-        *_not_ready(source),
-        *_awaited(source),
-    ]
-    every.sort(key=lambda cause: (_PLACES[cause.kind], cause.since or source.now))
+    every = [*_unread_or_invalid(source), *_denied(source)]
+    every += [*_not_ready(source), *_awaited(source)]
+    every.sort(key=lambda cause: ([*KINDS].index(cause.kind), cause.since or source.now))
     return every
 
 
@@ -125,46 +120,34 @@ def _denied(source: Source) -> Iterator[Cause]:
     by_override: dict[str, tuple[Override, list[Claim]]] = {}
     for claim, override in suspended_claims(source.state):
         by_override.setdefault(override.name, (override, []))[1].append(claim)
-    for override, claims in by_override.values():
-        what = " and ".join(dict.fromkeys(claim.subject.id for claim in claims))
-        applications = _applications_with(source, claims)
-        thing = "override", override.name
-        yield _denial(source, override, thing, what, "is booked", claims, applications)
+    denials: list[tuple[Override, tuple[str, str], str, list[Claim], Iterable[str]]] = [
+        (override, ("override", override.name), "", claims, _applications_with(source, claims))
+        for override, claims in by_override.values()
+    ]
     # the claims that need a denied release are not suspended as a whole
     for release, override in source.denied:
         claims = claims_behind(source.active.ledger, release)
         served = release.applications if isinstance(release, ServiceRelease) else ()
-        what, thing = release.description, ("release", release.name)
-        yield _denial(source, override, thing, what, "is needed", claims, served, release.name)
-
-
-def _denial(
-    source: Source,
-    override: Override,
-    thing: tuple[str, str],
-    what: str,
-    state: str,
-    claims: Sequence[Claim],
-    applications: Iterable[str],
-    *releases: str,
-) -> Cause:
-    change = source.last_change(override.path)
-    end = f", or wait until the override ends at {override.expires}" if override.expires else ""
-    return Cause(
-        "suspended",
-        what,
-        f"{state}, but {override.path} denies it",
-        f"{override.owner}, who owns the override",
-        f"remove the file by pull request{end}",
-        shlex.join(["git", "rm", override.path]),
-        change.time if change else None,
-        told=override.reason,
-        thing=thing,
-        releases=releases,
-        applications=tuple(dict.fromkeys(applications)),
-        requesters=requesters_of(claims),
-        demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
-    )
+        thing = "release", release.name
+        denials.append((override, thing, release.description, claims, served))
+    for override, thing, needed, claims, applications in denials:
+        change = source.last_change(override.path)
+        end = f", or wait until the override ends at {override.expires}" if override.expires else ""
+        yield Cause(
+            "suspended",
+            needed or " and ".join(dict.fromkeys(claim.subject.id for claim in claims)),
+            f"{'is needed' if needed else 'is booked'}, but {override.path} denies it",
+            f"{override.owner}, who owns the override",
+            f"remove the file by pull request{end}",
+            shlex.join(["git", "rm", override.path]),
+            change.time if change else None,
+            told=override.reason,
+            thing=thing,
+            releases=(thing[1],) if needed else (),
+            applications=tuple(dict.fromkeys(applications)),
+            requesters=requesters_of(claims),
+            demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
+        )
 
 
 def _applications_with(source: Source, claims: Iterable[Claim]) -> Iterator[str]:

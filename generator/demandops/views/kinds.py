@@ -20,7 +20,6 @@ from demandops.decide.bookkeeping import (
     service_entry,
     versions_asked,
 )
-from demandops.decide.override_report import Entry
 from demandops.decide.planning.overrides import suspended_by
 from demandops.model.config.base_model import duration_text, parse_time, relative
 from demandops.model.config.config import DOMAINS_FILE
@@ -29,7 +28,7 @@ from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.views import vocabulary
-from demandops.views.rows import Column, Row, TextsOf, labels_of
+from demandops.views.rows import Column, Row, TextsOf
 from demandops.views.source import Source, since_of, word_of, worst_word
 from demandops.views.vocabulary import Json, claim_data, lease_data, subject_text, time_data
 
@@ -60,9 +59,18 @@ class Kind:
         return self.name.capitalize()
 
     def row(self, item: Json) -> Row:
+        # the item's texts by label: `requesters` of an item is its label `requester`
+        labels: dict[str, list[str]] = {}
+        for key, value in item.items():
+            texts = [value] if isinstance(value, str) else value
+            if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
+                label = key[:-1] if key.endswith("s") and not isinstance(value, str) else key
+                labels.setdefault(label, []).extend(texts)
         more = self.labels(item)
         more[self.word] = (*more.get(self.word, ()), item["name"])
-        return Row(labels_of(item, **more), item)
+        for key, words in more.items():
+            labels[key] = [*dict.fromkeys((*labels.get(key, ()), *filter(None, words)))]
+        return Row(labels, item)
 
 
 def rows_of(source: Source, name: str) -> list[Row]:
@@ -546,16 +554,13 @@ def _appdefs(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 def _overrides(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     for entry in source.overrides:
-        yield entry.override.name, (entry,)
-
-
-def _override(source: Source, entry: Entry) -> Json:
-    return {
-        **vocabulary.override_data(entry.override),
-        "state": entry.state,
-        "releases": [vocabulary.release_data(release) for release in entry.releases],
-        "claims": [claim_data(claim) for claim in entry.claims],
-    }
+        item = {
+            **vocabulary.override_data(entry.override),
+            "state": entry.state,
+            "releases": [vocabulary.release_data(release) for release in entry.releases],
+            "claims": [claim_data(claim) for claim in entry.claims],
+        }
+        yield entry.override.name, (item,)
 
 
 def effect_texts(override: Json, *_: object) -> list[str]:
@@ -771,8 +776,7 @@ KINDS: dict[str, Kind] = {
                 _command("End it", lambda item: ["demandops", "override", "end", item["name"]]),
             ),
             _overrides,
-            _override,
-            lambda item: {
+            labels=lambda item: {
                 **{
                     key: [release[key] for release in item["releases"]]
                     for key in ("node", "domain", "cluster")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
+from datetime import datetime
 from functools import cached_property
 from typing import Any, Literal, TypeVar
 
@@ -79,22 +79,6 @@ class Row:
         return "\n".join(text for texts in self.texts.values() for text in texts)
 
 
-def labels_of(item: Json, **more: Iterable[str]) -> dict[str, list[str]]:
-    """Return the texts of an item by label: ``requesters`` of an item is its label ``requester``.
-
-    ``more`` has texts that the item's values do not say in one word.
-    """
-    labels: dict[str, list[str]] = {}
-    for key, value in item.items():
-        texts = [value] if isinstance(value, str) else value
-        if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
-            label = key[:-1] if key.endswith("s") and not isinstance(value, str) else key
-            labels.setdefault(label, []).extend(texts)
-    for key, words in more.items():
-        labels[key] = [*dict.fromkeys((*labels.get(key, ()), *filter(None, words)))]
-    return labels
-
-
 class Filter:
     """A search text for rows: a row matches if it contains all words of the text.
 
@@ -138,10 +122,6 @@ def page_of(items: Sequence[_Item], page: int, size: int) -> tuple[Sequence[_Ite
     pages = max(1, -(-len(items) // size))
     page = min(max(page, 1), pages)
     return items[(page - 1) * size : page * size], page, pages
-
-
-def utc(time: str) -> str:
-    return f"{parse_time(time).astimezone(timezone.utc):%Y-%m-%d %H:%M:%S}"
 
 
 def sorted_rows(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from typing import Any, Generic, TypeVar
 
 from demandops.base.errors import DemandOpsError
-from demandops.base.naming import Subject, SubjectKind
+from demandops.base.naming import SubjectKind
 from demandops.base.runtime import REAL
 from demandops.cluster.health import (
     ClusterDomain,
@@ -178,42 +178,39 @@ class Source:
             # same although its requesters changed
             if was and now and was.requesters != now.requesters:
                 keys.update(release_keys.keys_of_claims(self.active, [now]))
-        planned = before.planned | dict(self._with_other_claims(before, subjects))
-        for key in keys:
-            planned.pop(key, None)
-            if (release := self._plan(key)) or denied_release(new, key):
-                planned[key] = release
-        self.derived["planned"] = planned
-        self.rows.update((name, (None, rows)) for name, (_, rows) in before.rows.items())
-        return self
-
-    def _with_other_claims(
-        self, before: Source, subjects: Iterable[Subject]
-    ) -> Iterator[tuple[ReleaseKey, Planned]]:
+        # what is planned as before may be needed by other claims
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
         for subject in subjects:
-            was, now = (source.active.ledger.claims_on(subject) for source in (before, self))
-            gone |= {id(claim) for claim in was} - {id(claim) for claim in now}
-            before_ids = {id(claim) for claim in was}
+            claims = self.active.ledger.claims_on(subject)
+            ids_before = {id(claim) for claim in before.active.ledger.claims_on(subject)}
+            gone |= ids_before - {id(claim) for claim in claims}
             fresh[subject.kind][subject.id] = [
-                claim for claim in now if id(claim) not in before_ids
+                claim for claim in claims if id(claim) not in ids_before
             ]
-        for key, planned in before.planned.items():
-            if planned is None:
+        planned = {**before.planned}
+        for key, earlier in before.planned.items():
+            if earlier is None:
                 continue
-            release = planned.release
+            release = earlier.release
             if isinstance(release, ServiceRelease):
                 kind, ids = SubjectKind.APPLICATION, release.applications
             else:
                 kind, ids = SubjectKind.CONNECTION, release.connections
             if fresh[kind].keys().isdisjoint(ids):
                 continue
-            kept = [claim for claim in planned.claims if id(claim) not in gone]
+            kept = [claim for claim in earlier.claims if id(claim) not in gone]
             added = [claim for id in ids for claim in fresh[kind].get(id, ())]
             needing = [claim for claim in added if needs(claim, release)]
-            if needing or len(kept) < len(planned.claims):
-                yield key, replace(planned, claims=by_booking([*kept, *needing]))
+            if needing or len(kept) < len(earlier.claims):
+                planned[key] = replace(earlier, claims=by_booking([*kept, *needing]))
+        for key in keys:
+            planned.pop(key, None)
+            if (anew := self._plan(key)) or denied_release(new, key):
+                planned[key] = anew
+        self.derived["planned"] = planned
+        self.rows.update((name, (None, rows)) for name, (_, rows) in before.rows.items())
+        return self
 
     @property
     def commit(self) -> str:

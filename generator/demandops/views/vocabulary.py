@@ -8,15 +8,13 @@ from datetime import datetime
 from typing import Any
 
 from demandops.base.naming import Subject
-from demandops.decide.bookkeeping import versions_asked
 from demandops.model.config.base_model import plain
 from demandops.model.config.override import Override, format_time
 from demandops.model.config.registry import ImagePin
 from demandops.model.demand.demand import Lease
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import Claim
-from demandops.model.ledger.ledger import Ledger
-from demandops.model.release import Release, ServiceRelease
+from demandops.model.release import Release
 from demandops.render.gitops import path_of
 from demandops.repo.history.commit_log import LogEntry
 
@@ -79,16 +77,6 @@ def place_data(release: Release) -> Json:
 
 def release_data(release: Release) -> Json:
     return {"name": release.name, **place_data(release), "file": path_of(release)}
-
-
-def version_data(release: Release, ledger: Ledger) -> Json:
-    if not isinstance(release, ServiceRelease):
-        return {"version": None, "application_version": None, "versions_asked": {}}
-    return {
-        "version": release.chart.version,
-        "application_version": release.version.name or None,
-        "versions_asked": versions_asked(release, ledger),
-    }
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:

@@ -78,10 +78,11 @@ def find(source: Source, name: str, kind: str | None = None) -> Thing:
     reader = source.reader()
     if name.startswith(("clusters/", "bootstrap/", f"{claim_files.LEDGER_ROOT}/")):
         return _by_path(source, reader, name.rstrip("/"))
+    node = Thing("node", name)
     there = {each: path for each, path in _there(source, name) if kind in (None, each)}
     if not there:
         there = {each: path for each, path in _gone(source, reader, name) if kind in (None, each)}
-    elif {*there} == {"node"} and not kind and _is_unused(source, name):
+    elif {*there} == {"node"} and not kind and _node(source, node)["state"] == "unused":
         # it may have the name of a requester that has left, which is then what is asked for
         gone = (each for each, _ in _gone(source, reader, name) if each == "requester")
         there |= dict.fromkeys(gone, "")
@@ -140,7 +141,8 @@ def _demands(source: Source) -> set[str]:
 def _there(source: Source, name: str) -> Iterator[tuple[str, str]]:
     # the kinds of things that have this whole name now, each with its path
     config, ledger = source.config, source.state.ledger
-    if release := source.releases.get(name) or _denied(source, name):
+    denied = (release for release, _ in source.denied if release.name == name)
+    if release := source.releases.get(name) or next(denied, None):
         yield "release", path_of(release)
     for subject in (Subject(kind, name) for kind in SubjectKind):
         if ledger.claims_on(subject):
@@ -185,10 +187,6 @@ def _is_about_proposal(entry: LogEntry, branch: str) -> bool:
     return entry.first(PROPOSAL) == branch or entry.first(REJECTS).partition(" ")[0] == branch
 
 
-def _denied(source: Source, name: str) -> Release | None:
-    return next((release for release, _ in source.denied if release.name == name), None)
-
-
 def _by_path(source: Source, reader: Reader, path: str) -> Thing:
     if (claim := ledger_files.claim_in(path, source.state.ledger)) is not None:
         return Thing("claim", claim.demand, path)
@@ -223,7 +221,10 @@ def explain(source: Source, thing: Thing, most: int = 10) -> Json:
         "name": thing.name,
         "also": list(thing.also),
         "file": thing.path or None,
-        "proposals": [_proposal_data(proposal) for proposal in _proposals(source, thing)],
+        "proposals": [
+            asdict(proposal) | {"since": time_data(proposal.since)}
+            for proposal in _proposals(source, thing)
+        ],
         **_EXPLAINED[thing.kind](source, thing),
         **_past(source, reader, thing, most),
     }
@@ -255,10 +256,6 @@ def _proposals(source: Source, thing: Thing) -> Iterator[PendingProposal]:
         override = each.branch.removeprefix("override/")
         if thing.name in (named | {"override": (override,)}).get(thing.kind, ()):
             yield each
-
-
-def _proposal_data(proposal: PendingProposal) -> Json:
-    return asdict(proposal) | {"since": time_data(proposal.since)}
 
 
 def _release(source: Source, thing: Thing) -> Json:
@@ -358,10 +355,6 @@ def _node(source: Source, thing: Thing) -> Json:
     return _used(held | {"what": what})
 
 
-def _is_unused(source: Source, node: str) -> bool:
-    return bool(_node(source, Thing("node", node))["state"] == "unused")
-
-
 def _override(source: Source, thing: Thing) -> Json:
     entry = next((e for e in source.overrides if e.override.name == thing.name), None)
     if entry is None:
@@ -438,10 +431,15 @@ def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | Non
         denying = suspended_by(claim, source.state)
         suspended += denying is not None
         kept = source.config.overrides.get(claim.keeping_override or "")
+        way = f"send request '{claim.request}' again with shutdown: true"
+        if claim.keeping_override is not None:
+            way = f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
+        elif is_released_by_demand_id(claim):
+            way = f"send 'operation: release' for demand '{claim.demand}'"
         rows.append(
             claim_data(claim)
             | {
-                "release_by": _how_to_release(claim),
+                "release_by": way,
                 "overdue": claim.lease is not None and claim.lease.has_ended(source.now),
                 "kept_by": override_data(kept, ("keep",)) if kept else None,
                 "suspended_by": override_data(denying, ("deny",)) if denying else None,
@@ -459,14 +457,6 @@ def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | Non
             for name, release in sorted(by_name.items())
         ]
     return data
-
-
-def _how_to_release(claim: Claim) -> str:
-    if claim.keeping_override is not None:
-        return f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
-    if is_released_by_demand_id(claim):
-        return f"send 'operation: release' for demand '{claim.demand}'"
-    return f"send request '{claim.request}' again with shutdown: true"
 
 
 def is_released_by_demand_id(claim: Claim) -> bool:
@@ -556,19 +546,16 @@ def release_of(source: Source, demand: str) -> tuple[Json, Decision | None, str]
 def stopped_with(source: Source, name: str) -> list[str]:
     """Return the other releases that an override stops which denies this one."""
     release = source.releases[name]
-    if isinstance(release, ServiceRelease):  # it denies the service on its node, for whatever
-        place = release.key.service, release.node.id
-        return [
-            other.name
-            for other in source.releases.values()
-            if isinstance(other, ServiceRelease)
-            and other.name != name
-            and (other.key.service, other.node.id) == place
-        ]
-    return [  # it denies all connections that the client carries
-        other.name
-        for other in source.releases.values()
-        if not isinstance(other, ServiceRelease)
-        and other.name != name
-        and {*other.connections} <= {*release.connections}
-    ]
+
+    def is_stopped(other: Release) -> bool:
+        if isinstance(release, ServiceRelease):  # it denies the service on its node, for whatever
+            return isinstance(other, ServiceRelease) and (
+                (other.key.service, other.node.id) == (release.key.service, release.node.id)
+            )
+        # it denies all connections that the client carries
+        return not isinstance(other, ServiceRelease) and (
+            {*other.connections} <= {*release.connections}
+        )
+
+    others = (other for other in source.releases.values() if other.name != name)
+    return [other.name for other in others if is_stopped(other)]

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 from demandops.base.errors import InvalidInput
 from demandops.base.strict_yaml import read_input
-from demandops.cli.json_output import output_option
+from demandops.cli.formats import output_option
 from demandops.cli.output import errors
 from demandops.detect import rule_file
 

@@ -12,9 +12,9 @@ from typing import Any
 
 from demandops.base.errors import InvalidInput
 from demandops.base.quoting import one_line
-from demandops.cli import json_output
+from demandops.cli import formats
+from demandops.cli.formats import Table
 from demandops.cli.output import errors
-from demandops.cli.table import Table
 from demandops.detect.condition import Count, Near, entity_in
 from demandops.detect.detector import Detector
 from demandops.detect.event_engine import Event, Key, MessageReader, Observation, Unreadable
@@ -281,7 +281,7 @@ def show(replay: Replay, output: str) -> None:
         f"{replay.span[1] - replay.span[0]:.1f} s; events that have not stopped: "
         f"{len(replay.lasting)}"
     )
-    json_output.show(output, as_data(replay), [Table(columns, rows), summary])
+    formats.show(output, as_data(replay), [Table(columns, rows), summary])
     for (topic, why), count in replay.left_out.items():
         lost = " is" if topic == REST_OF_BAG else f": {count} messages are"
         errors.print(f"warning: {topic}{lost} left out: {why}")

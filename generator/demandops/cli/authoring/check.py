@@ -10,11 +10,11 @@ from pathlib import Path
 import click
 
 from demandops.base.quoting import lines, one_line
-from demandops.cli.json_output import output_formats, print_json
+from demandops.cli.formats import output_formats, print_json
 from demandops.cli.output import busy, console, errors
-from demandops.cli.queries.diff import entry_lines, release_lines
+from demandops.cli.queries.commits import entry_lines, release_lines
 from demandops.decide.bookkeeping import EntryChange
-from demandops.decide.changeset import CHANGE_ORDER, FileChange, MergePreview
+from demandops.decide.changeset import CHANGE_ORDER, FileChange
 from demandops.repo.merge_check import merge_check
 from demandops.repo.merge_check.merge_check import CheckResult
 from demandops.repo.merge_check.rendered_charts import MISSING, NO_HELM, RenderedCharts
@@ -280,7 +280,7 @@ def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], 
     return shown, left_out
 
 
-def _lines(checked: CheckResult) -> Iterator[str]:
+def _lines(checked: CheckResult) -> Iterator[str]:  # noqa: PLR0912 - a part each
     for override in checked.suggestions:
         yield f"\ninstead of editing {override.instead_of}, write {override.file}:\n"
         yield from override.text.splitlines()
@@ -307,10 +307,6 @@ def _lines(checked: CheckResult) -> Iterator[str]:
     if checked.bookkeeping:
         yield "\nbookkeeping:"
         yield from (f"  {line}" for line in entry_lines(checked.bookkeeping))
-    yield from _file_lines(consequence)
-
-
-def _file_lines(consequence: MergePreview) -> Iterator[str]:
     others, files = {*consequence.other_files}, consequence.files
     if not files:
         return

@@ -17,7 +17,7 @@ from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.naming import PATTERN_WORDS
 from demandops.base.quoting import quoted
 from demandops.base.settings import data_folder
-from demandops.cli.json_output import Command, output_option, show
+from demandops.cli.formats import Command, output_option, show
 from demandops.cli.output import busy
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.decide.state import State, try_configuration
@@ -161,75 +161,64 @@ class _Service:
 
 def _input(text: str) -> tuple[str, str]:
     if not (match := _INPUT.fullmatch(text)):
-        raise click.BadParameter(
-            f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image",
-            param_hint="--input",
-        )
+        raise ValueError(f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image")
     if short := _SHORT_TYPE.fullmatch(match["type"]):
-        raise click.BadParameter(
-            f"'{text}' has no message type of ROS 2; write "
-            f"{match['role']}={short['package']}/msg/{short['name']}",
-            param_hint="--input",
-        )
+        full = f"{match['role']}={short['package']}/msg/{short['name']}"
+        raise ValueError(f"'{text}' has no message type of ROS 2; write {full}")
     return match["role"], match["type"]
 
 
 def _service(text: str) -> _Service:
     if not (match := _SERVICE.fullmatch(text)):
-        raise click.BadParameter(
-            f"'{text}' is not NAME=PACKAGE/FILE; write it like "
-            "detector=my_package/detector.launch.py",
-            param_hint="--service",
-        )
+        example = "detector=my_package/detector.launch.py"
+        raise ValueError(f"'{text}' is not NAME=PACKAGE/FILE; write it like {example}")
     return _Service(match["name"], match["package"], match["file"])
 
 
 def _image(text: str) -> Image:
-    try:
-        image = addresses.image(text)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--image") from None
+    image = addresses.image(text)
     if not (image.tag or image.digest):
-        raise click.BadParameter(
-            f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
-        )
+        raise ValueError(f"'{text}' has no tag or digest; write {text}:TAG")
     return Image(repository=image.name, tag=image.tag or None, digest=image.digest or None)
 
 
-# Maps an option to the question that asks for its values, what reads a value, and how many may be
-# given; None means any number.
-_QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
+# Maps an option to the question that asks for its values, and what reads a value.
+_QUESTIONS: Mapping[str, tuple[str, Callable[[str], object]]] = {
     "--input": (
         "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; separate several by spaces",
         _input,
-        None,
     ),
     "--service": (
         "Services, as name=package/file, such as detector=my_package/detector.launch.py; separate "
         "several by spaces",
         _service,
-        None,
     ),
-    "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
+    "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image),
 }
 
 
-def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
-    """Ask until the answer is at most ``most`` valid words; ``check`` raises for another word."""
+def _read(option: str, word: str) -> Any:  # noqa: ANN401
+    try:
+        return _QUESTIONS[option][1](word)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint=option) from None
 
+
+def _asked(option: str) -> tuple[str, ...]:
+    # until the answer has only words that are valid
     def valid(answer: str) -> tuple[str, ...]:
         if not (words := tuple(answer.split())):
             raise click.UsageError(
                 "an answer is needed; Ctrl-C ends the command, and nothing is written"
             )
-        if most is not None and len(words) > most:
-            raise click.UsageError(f"'{answer}' has {len(words)} words; give {most}")
+        if option == "--image" and len(words) > 1:
+            raise click.UsageError(f"'{answer}' has {len(words)} words; give 1")
         for word in words:
-            check(word)
+            _read(option, word)
         return words
 
     words: tuple[str, ...]
-    words = click.prompt(question, default="", show_default=False, value_proc=valid)
+    words = click.prompt(_QUESTIONS[option][0], default="", show_default=False, value_proc=valid)
     return words
 
 
@@ -297,10 +286,10 @@ def application(  # noqa: PLR0913 - as many as options
     if missing and not sys.stdin.isatty():
         options = ", ".join(f"'{option}'" for option in missing)
         raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
-    values = {option: given[option] or _asked(*_QUESTIONS[option]) for option in given}
-    planned = [_service(text) for text in values["--service"]]
-    types = dict(map(_input, values["--input"]))
-    pulled = _image(values["--image"][0])
+    values = {option: given[option] or _asked(option) for option in given}
+    planned: list[_Service] = [_read("--service", word) for word in values["--service"]]
+    types = dict(_read("--input", word) for word in values["--input"])
+    pulled = _read("--image", values["--image"][0])
     # a demand can name only nodes in an access domain
     nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
     if not (node or nodes):

@@ -1,1 +1,1 @@
-"""Commands that write to the state repo: bookings, approvals and overrides."""
+"""Commands that write to the state repo: bookings, and what people commit."""

@@ -24,9 +24,9 @@ from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
 from demandops.cli.changes import ledger_change
 from demandops.cli.changes.ledger_change import started_generator
-from demandops.cli.json_output import faults_of, output_option, print_json
+from demandops.cli.formats import faults_of, output_option, print_json
 from demandops.cli.output import console, done, errors, progress
-from demandops.cli.queries.diff import release_lines
+from demandops.cli.queries.commits import release_lines
 from demandops.cli.target import (
     NO_STATE_REPO,
     dry_run_option,

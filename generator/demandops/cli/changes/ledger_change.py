@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +22,10 @@ from demandops.cli.changes.person_change import (
     consequence,
     warned_if_unnamed,
 )
-from demandops.cli.json_output import show
+from demandops.cli.formats import show
 from demandops.cli.output import busy, done, errors, fitted, progress, terminal_width
-from demandops.cli.queries.diff import resolved
-from demandops.cli.target import names_of
+from demandops.cli.queries.commits import resolved
+from demandops.cli.target import name_options, names_of
 from demandops.decide.decision import decide
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS
@@ -76,20 +76,13 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
 Goal = Decommission | Rollback
 
 
-@dataclass(frozen=True, slots=True)
-class _Booked:
-    goal: Goal
-    data: Json
-    changes: Sequence[ClaimChange]
-    lines: Sequence[str]  # about what followed, or would follow
-
-
 def _book(
     goal_of: Callable[[Reader, State], Goal], told: Callable[[ClaimChange], str], options: Options
-) -> _Booked:
+) -> tuple[Json, Sequence[ClaimChange], list[str]]:
     """Book a goal through the journal like a demand, so that others may write meanwhile.
 
-    ``told`` returns a line about a changed claim.
+    ``told`` returns a line about a changed claim. Return the JSON, the changes, and lines about
+    what followed, or would follow.
     """
     with reader.opened(options.state_repo, only_read=options.dry_run) as repo:
         with progress("reading the ledger") as report:
@@ -105,7 +98,7 @@ def _book(
             is_known = is_node and goal.id in state.config.nodes
             if not is_known or {fault.code for fault in error.faults} != {"not-held"}:
                 raise
-            return _Booked(goal, data, (), ())
+            return data, (), []
     changes = decision.changes.claims
     data |= {
         "outcome": decision.outcome,
@@ -117,7 +110,7 @@ def _book(
     lines += consequence(decision.releases, who, less)
     lines = [fitted(line, terminal_width()) for line in lines]
     if options.dry_run:
-        return _Booked(goal, data, changes, lines)
+        return data, changes, lines
     if decision.outcome != "unchanged":
         for line in lines if options.output == "text" and not options.yes else ():
             errors.print(line)
@@ -130,7 +123,7 @@ def _book(
         receipt = ticket.future.result()
     done.append(f"{receipt.outcome} in {receipt.commit}")
     data |= {"outcome": receipt.outcome, "commit": receipt.commit}
-    return _Booked(goal, data, receipt.changes, [*map(told, receipt.changes)])
+    return data, receipt.changes, [*map(told, receipt.changes)]
 
 
 def claim_text(change: ClaimChange) -> str:
@@ -143,23 +136,25 @@ def claim_text(change: ClaimChange) -> str:
 
 
 def _end(name: str, kinds: Sequence[str], options: Options) -> None:
+    ended = name
+
     def goal_of(repo: Reader, state: State) -> Goal:
-        meant, by = _meant(name, kinds, state), str(repo.operator())
-        return goals.decommission(meant, frozenset(kinds), by, options.reason)
+        nonlocal ended
+        ended = _meant(name, kinds, state)
+        by = str(repo.operator())
+        return goals.decommission(ended, frozenset(kinds), by, options.reason)
 
     def told(change: ClaimChange) -> str:
         left = f"; kept for {', '.join(change.after.requesters)}" if change.after else ""
         return f"{'reduced: ' if left else 'released:'} {claim_text(change)}{left}"
 
-    booked = _book(goal_of, told, options)
-    data, ended = booked.data, booked.goal.id
+    data, changes, lines = _book(goal_of, told, options)
     data["claims"] = [
         claim_data(change.before)
         | {"left": list(change.after.requesters) if change.after else None}
-        for change in booked.changes
+        for change in changes
         if change.before
     ]
-    lines = [*booked.lines]
     if data["outcome"] == "unchanged":
         lines = [f"'{ended}' holds nothing"]
     elif data["commit"]:
@@ -261,19 +256,13 @@ def decommission(name: str, kind: str | None, options: Options) -> None:
 
 @click.command()
 @click.argument("revision", metavar="REV|TIME")
-@click.option(
-    "--demand",
+@name_options(
+    {
+        "demand": "Roll back only this demand.",
+        "application": "Roll back only this application, with the connections of its demands.",
+    },
     metavar="ID",
     default="",
-    shell_complete=names_of("demands"),
-    help="Roll back only this demand.",
-)
-@click.option(
-    "--application",
-    metavar="ID",
-    default="",
-    shell_complete=names_of("applications"),
-    help="Roll back only this application, with the connections of its demands.",
 )
 @click.option(
     "--drop-newer",
@@ -319,10 +308,11 @@ def rollback(
             return "dropped"
         return "changed back" if change.before else "restored"
 
-    booked = _book(goal_of, lambda change: f"{way(change)}: {claim_text(change)}", options)
-    data, lines = booked.data, [*booked.lines]
+    data, changes, lines = _book(
+        goal_of, lambda change: f"{way(change)}: {claim_text(change)}", options
+    )
     for each in ("restored", "changed back", "dropped"):
-        of_way = (change.after or change.before for change in booked.changes if way(change) == each)
+        of_way = (change.after or change.before for change in changes if way(change) == each)
         data[each.replace(" ", "_")] = [claim_data(claim) for claim in of_way if claim]
     if data["outcome"] == "unchanged":
         lines = [f"the ledger is the same as at {to[:10]}; there is nothing to roll back"]

@@ -16,11 +16,11 @@ from demandops.base.naming import SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
-from demandops.cli import json_output
+from demandops.cli import formats
+from demandops.cli.formats import Table, list_table
 from demandops.cli.output import at_option, errors, warn_of_not_rendered
-from demandops.cli.queries.diff import loaded
+from demandops.cli.queries.commits import loaded
 from demandops.cli.queries.status import ask_clusters
-from demandops.cli.table import Table, list_table
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.cluster import clusters_file
 from demandops.model.config.policy import matches
@@ -97,7 +97,7 @@ def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
     is_flag=True,
     help="Print the list again when a new commit or proposal changes it.",
 )
-@json_output.output_formats("text", "wide", "name", "json", "yaml", "jsonpath=…")
+@formats.output_formats("text", "wide", "name", "json", "yaml", "jsonpath=…")
 def get(
     kind: str,
     names: tuple[str, ...],
@@ -250,7 +250,7 @@ def _print_list(kind: Kind, source: Source, rows: list[Row], output: str, watch:
     items = [row.item for row in rows]
     plain = json.loads(json.dumps({"kind": kind.name, "commit": source.commit, "items": items}))
     if output == "json" and watch:
-        click.echo(json_output.json_text(plain))
+        click.echo(formats.json_text(plain))
     elif output == "yaml":
         click.echo(("---\n" if watch else "") + strict_yaml.dump(plain), nl=False)
     else:
@@ -258,4 +258,4 @@ def _print_list(kind: Kind, source: Source, rows: list[Row], output: str, watch:
         if output != "name":
             shown = [list_table(kind, rows, source.now, wide=output == "wide")]
             shown += [f"{source.now:%H:%M:%S} UTC, at {source.commit[:10]}"] if watch else []
-        json_output.show(output, plain, shown)
+        formats.show(output, plain, shown)

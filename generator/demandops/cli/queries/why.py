@@ -9,10 +9,10 @@ import click
 
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import output_formats, output_option, show
+from demandops.cli.formats import output_formats, output_option, show
 from demandops.cli.output import at_option, busy, fitted, terminal_width
-from demandops.cli.queries.diff import loaded
-from demandops.cli.target import names_of, state_repo_option
+from demandops.cli.queries.commits import loaded
+from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.decide.decision import may_demand
 from demandops.model.config.base_model import duration_text
 from demandops.repo import reader
@@ -36,7 +36,7 @@ _GONE = {
 _OF_RELEASES = {"demand": "needs", "requester": "needs", "override": "applies to"}
 
 
-def _standing_lines(answer: Json) -> Iterator[str]:
+def lines_of(answer: Json) -> Iterator[str]:  # noqa: PLR0912 - a part each
     kind, state = answer["kind"], answer["state"]
     phrase = _STATES.get(state, f"is {state}")
     phrase = _GONE.get(kind, phrase) if state == "gone" else phrase
@@ -57,10 +57,6 @@ def _standing_lines(answer: Json) -> Iterator[str]:
         since = f"since {time_text(proposal['since'])} by {proposal['author']}"
         yield f"    {since}{f'; approval is required by {reasons}' if reasons else ''}"
         yield f"    to answer it: demandops approve|reject {proposal['branch']} -m REASON"
-
-
-def lines_of(answer: Json) -> Iterator[str]:
-    yield from _standing_lines(answer)
     if answer["runs"] and "node" in answer:
         yield (
             f"  where       node {answer['node']}, cluster {answer['cluster']}, namespace "
@@ -87,7 +83,19 @@ def lines_of(answer: Json) -> Iterator[str]:
     if answer.get("overrides"):
         yield "overridden by"
         yield from (f"  {_override_text(override)}" for override in answer["overrides"])
-    yield from _history_lines(answer)
+    if answer["stopped"]:
+        yield "rejected by" if answer["state"] == "rejected" else "stopped by"
+        yield from _commit_lines(answer["stopped"], why=True)
+    if answer["changes"]:
+        yield "changed by"
+        for entry in answer["changes"]:
+            yield from _commit_lines(entry, why=False)
+    if answer["more_changes"]:
+        git_log = f", or run git log -- {answer['file']}" if answer["file"] else ""
+        yield f"  and {answer['more_changes']} earlier commits; to see them, raise -n{git_log}"
+    if answer["started"]:
+        yield "started by"
+        yield from _commit_lines(answer["started"], why=True)
 
 
 def _claim_lines(claims: list[Json]) -> Iterator[str]:
@@ -134,22 +142,6 @@ def _override_text(override: Json) -> str:
         f"{override['file']}: {', '.join(override['effects'])} (priority "
         f"{override['priority']}{until}), of {override['owner']}: {override['reason']}"
     )
-
-
-def _history_lines(answer: Json) -> Iterator[str]:
-    if answer["stopped"]:
-        yield "rejected by" if answer["state"] == "rejected" else "stopped by"
-        yield from _commit_lines(answer["stopped"], why=True)
-    if answer["changes"]:
-        yield "changed by"
-        for entry in answer["changes"]:
-            yield from _commit_lines(entry, why=False)
-    if answer["more_changes"]:
-        git_log = f", or run git log -- {answer['file']}" if answer["file"] else ""
-        yield f"  and {answer['more_changes']} earlier commits; to see them, raise -n{git_log}"
-    if answer["started"]:
-        yield "started by"
-        yield from _commit_lines(answer["started"], why=True)
 
 
 def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
@@ -224,13 +216,7 @@ def why(
 @click.argument("requester", metavar="REQUESTER", shell_complete=names_of("requesters"))
 @click.argument("verb", type=click.Choice(["demand"]), metavar="demand")
 @click.argument("application", metavar="APPLICATION", shell_complete=names_of("appdefs"))
-@click.option(
-    "--node",
-    metavar="NODE",
-    default="",
-    shell_complete=names_of("nodes"),
-    help="On this node. Default: on any.",
-)
+@name_options({"node": "On this node. Default: on any."}, metavar="NODE", default="")
 @click.option("--version", metavar="VERSION", default="", help="In this version.")
 @state_repo_option
 @output_option

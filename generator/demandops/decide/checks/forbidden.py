@@ -103,15 +103,11 @@ def warnings(request: Demand, world: World) -> Iterator[str]:
         *world.ledger.claims_of_demand(request.demand),
         *(claim for subject in request.subjects() for claim in world.ledger.claims_on(subject)),
     ]
-    seen = set()
-    requesters = set(request.requesters())
-    for claim in claims:
+    for claim in {claim.key: claim for claim in claims}.values():
         override = overrides.suspended_by(claim, world)
-        if override is None or claim.key in seen or not requesters & set(claim.requesters):
-            continue
-        seen.add(claim.key)
-        by = f"{override.path} of {override.owner}: {override.reason}"
-        yield f"{claim.subject} is suspended by {by}"
+        if override and {*request.requesters()} & {*claim.requesters}:
+            by = f"{override.path} of {override.owner}: {override.reason}"
+            yield f"{claim.subject} is suspended by {by}"
 
 
 # ---- quotas of an access domain: claims for each requester, and services on each node ----

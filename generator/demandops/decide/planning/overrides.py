@@ -161,8 +161,7 @@ def suspended_claims(world: World) -> Iterator[tuple[Claim, Override]]:
     if not any(override.deny for override in world.overrides):
         return
     for claim in sorted(world.ledger, key=lambda claim: (str(claim.subject), claim.demand)):
-        override = suspended_by(claim, world)
-        if override is not None:
+        if override := suspended_by(claim, world):
             yield claim, override
 
 

@@ -230,8 +230,7 @@ class _ClaimedConnections:
         united = replace(first, broker=next(filter(None, brokers), ""), topics=topics)
         # A person may have written a claim with a route that this type cannot carry, or have
         # removed from the inventory what the connection needs.
-        problems = list(route_faults(self.type, united, self.world.config))
-        if problems:
+        if problems := list(route_faults(self.type, united, self.world.config)):
             raise Refused(
                 replace(problem, field="connections", message=f"'{id}': {problem.message}")
                 for problem in problems

@@ -130,39 +130,31 @@ class DemandGoal(FrozenModel):
         )
 
 
-def _with_parameters(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
-    """Return a goal with ``parameters_json`` read into ``parameters``, and the faults of both."""
-    faults: list[Fault] = []
-
-    def read(index: int, app: Any) -> Any:  # noqa: ANN401 - plain data
-        given = app.get("parameters", {}) if isinstance(app, dict) else None
-        texts = app.get("parameters_json", {}) if isinstance(app, dict) else None
-        if not isinstance(given, dict) or not isinstance(texts, dict):
-            return app
-        where, values = f"applications[{index}]", dict(given)
-        problems = {f"{where}.parameters.{name}": _value_problem(given[name], 0) for name in given}
-        for name, text in texts.items():
-            try:
-                if name in given:
-                    problem = "is already given in parameters; give it once"
-                else:
-                    values[name] = json.loads(text)
-                    problem = _value_problem(values[name], 0)
-            except (json.JSONDecodeError, TypeError):
-                problem = 'is not JSON; text needs its own quotes, as in ""fast""'
-            except RecursionError:
-                problem = _TOO_DEEP
-            except ValueError:  # Python refuses to convert integers of more than 4300 digits
-                problem = "has an integer of too many digits; write a shorter one"
-            problems[f"{where}.parameters_json.{name}"] = problem
-        faults.extend(fault(field, problem) for field, problem in problems.items() if problem)
-        others = {name: value for name, value in app.items() if name != "parameters_json"}
-        return others | ({"parameters": values} if values else {})
-
-    listed = goal.get("applications")
-    if isinstance(listed, list):
-        goal = goal | {"applications": [read(index, app) for index, app in enumerate(listed)]}
-    return goal, faults
+def _with_parameters(index: int, app: Any, faults: list[Fault]) -> Any:  # noqa: ANN401 - plain data
+    """Return an application with ``parameters_json`` read into ``parameters``; collect faults."""
+    given = app.get("parameters", {}) if isinstance(app, dict) else None
+    texts = app.get("parameters_json", {}) if isinstance(app, dict) else None
+    if not isinstance(given, dict) or not isinstance(texts, dict):
+        return app
+    where, values = f"applications[{index}]", dict(given)
+    problems = {f"{where}.parameters.{name}": _value_problem(given[name], 0) for name in given}
+    for name, text in texts.items():
+        try:
+            if name in given:
+                problem = "is already given in parameters; give it once"
+            else:
+                values[name] = json.loads(text)
+                problem = _value_problem(values[name], 0)
+        except (json.JSONDecodeError, TypeError):
+            problem = 'is not JSON; text needs its own quotes, as in ""fast""'
+        except RecursionError:
+            problem = _TOO_DEEP
+        except ValueError:  # Python refuses to convert integers of more than 4300 digits
+            problem = "has an integer of too many digits; write a shorter one"
+        problems[f"{where}.parameters_json.{name}"] = problem
+    faults.extend(fault(field, problem) for field, problem in problems.items() if problem)
+    others = {name: value for name, value in app.items() if name != "parameters_json"}
+    return others | ({"parameters": values} if values else {})
 
 
 # How many levels a parameter's value may have. It is a part of a claim's file, which may have 100.
@@ -345,7 +337,10 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
     if faults:
         raise Refused(faults)
     model: type[DemandGoal | WireGoal] = DemandGoal if is_demand_goal(data) else WireGoal
-    united, faults = _with_parameters(data) if model is DemandGoal else (data, [])
+    united, apps = data, data.get("applications") if model is DemandGoal else None
+    if isinstance(apps, list):
+        read = [_with_parameters(index, app, faults) for index, app in enumerate(apps)]
+        united = data | {"applications": read}
     try:
         parsed = model.model_validate(united, context=GOAL)
     except ValidationError as error:

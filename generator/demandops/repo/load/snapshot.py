@@ -129,10 +129,7 @@ def load(
 
 
 def ledger_at(
-    repo: Repository,
-    commit: Commit,
-    progress: Progress = lambda done, total: None,
-    entry: LogEntry | None = None,
+    repo: Repository, commit: Commit, progress: Progress, entry: LogEntry | None
 ) -> tuple[Ledger, dict[str, Claim | None], list[Fault]]:
     """Return the ledger, with what is in effect for files of claims that are not valid."""
     put_back, faults = dict[str, Claim | None](), list[Fault]()

@@ -55,6 +55,7 @@ HELM_BIN = "HELM_BIN"
 # also on a busy machine; the other one ends a helm that waits.
 _HELM_CPU_S = 30
 _HELM_S = 300
+_MOST_SECONDS = 1800  # of all charts of a check; 5,000 releases take about 1,000 s
 _MOST_OUTPUT = 16 << 20
 # Patterns search the text of a message, whose length is the author's choice.
 _MOST_MESSAGE = 4_000
@@ -81,11 +82,13 @@ class Helm:
     """The installed program ``helm``. Its ``home`` is a folder that holds nothing else."""
 
     program: str
+    end: float  # of the monotonic clock: when it may render nothing more
 
     @staticmethod
     def find() -> Helm | None:
         program = shutil.which(os.environ.get(HELM_BIN) or "helm")
-        return Helm(str(Path(program).absolute())) if program else None
+        end = REAL.monotonic() + _MOST_SECONDS
+        return Helm(str(Path(program).absolute()), end) if program else None
 
     def lint(self, chart: Path, values: Path, home: Path) -> Report:
         code, out, err = self._run(home, "lint", str(chart), f"--values={values}")
@@ -187,7 +190,6 @@ NO_HELM = (
     f"leave {HELM_BIN} unset"
 )
 _SCHEMA = "values.schema.json"
-_MOST_SECONDS = 1800  # 5,000 releases take about 1,000 s
 
 
 @dataclass
@@ -212,7 +214,6 @@ def render_charts(  # noqa: PLR0912
     generated files at the paths ``wanted`` change.
     """
     config, result, helm = state.config, RenderedCharts(), Helm.find()
-    end = REAL.monotonic() + _MOST_SECONDS
     # by folder, the releases, and whether each is an example
     by_folder: dict[str | None, list[tuple[ServiceRelease, bool]]] = {}
     for release in changeset.planned_releases(state).values():
@@ -245,16 +246,7 @@ def render_charts(  # noqa: PLR0912
                 result.not_rendered |= dict.fromkeys(names, reason)
             elif helm:
                 with TemporaryDirectory(prefix="demandops-helm-") as scratch:
-                    _render(
-                        helm,
-                        Path(scratch),
-                        folder,
-                        files,
-                        pairs,
-                        state=state,
-                        result=result,
-                        end=end,
-                    )
+                    _render(helm, Path(scratch), folder, files, pairs, state, result)
         except InvalidInput as error:
             result.faults |= dict.fromkeys(error.faults)
     if helm is None:
@@ -265,16 +257,14 @@ def render_charts(  # noqa: PLR0912
     return result
 
 
-def _render(  # noqa: PLR0913 - a chart, what to render it with, and where the result goes
+def _render(
     helm: Helm,
     scratch: Path,
     folder: str,
     files: Mapping[str, str],
     releases: Sequence[tuple[ServiceRelease, bool]],
-    *,
     state: State,
     result: RenderedCharts,
-    end: float,
 ) -> None:
     home, file, config = scratch / "home", scratch / "values.json", state.config
     chart = scratch / "chart" / folder.rpartition("/")[2]
@@ -305,7 +295,7 @@ def _render(  # noqa: PLR0913 - a chart, what to render it with, and where the r
         if f"{release.name} {text}" in seen:
             continue
         seen.add(f"{release.name} {text}")
-        if REAL.monotonic() > end:
+        if REAL.monotonic() > helm.end:
             message = f"is not rendered, because helm took more than {_MOST_SECONDS} s in all; "
             raise InvalidInput.at("", f"{message}make it simpler", file=folder)
         _check_libraries(state, folder, data)

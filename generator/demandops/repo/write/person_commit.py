@@ -24,7 +24,6 @@ from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.repository import MAIN, StateRepository
 from demandops.repo.history import commit_message
 from demandops.repo.history.commit_log import Person
-from demandops.repo.history.commit_message import compose
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.proposal_branch import PendingProposal, ProposalBranches
@@ -47,9 +46,9 @@ class CommitDetails:
     @property
     def text(self) -> str:
         if self.trailers:
-            return compose([[self.summary]], self.trailers)
+            return commit_message.compose([[self.summary]], self.trailers)
         # the person's reason is as written: it may close an issue
-        return compose([[self.summary]], []) + (
+        return commit_message.compose([[self.summary]], []) + (
             f"\n{one_line(self.reason)}\n" if self.reason else ""
         )
 

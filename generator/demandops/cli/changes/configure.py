@@ -1,28 +1,39 @@
-"""``demandops override``, ``suspend`` and ``resume``: deviations that a person declares."""
+"""What a person configures, each in one commit: overrides, drained nodes, and reverts.
+
+The commands ``override``, ``suspend``, ``resume``, ``drain``, ``undrain`` and ``revert``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import shlex
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from datetime import timedelta
 from typing import Any
 
 import click
 
 from demandops.base import naming, strict_yaml
-from demandops.base.errors import InvalidInput, fault, suggestion
+from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.base.strict_yaml import read_input
+from demandops.base.settings import GENERATED_ROOTS
+from demandops.base.strict_yaml import faults_in, read_input
 from demandops.cli import target
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import Options, changing, propose_option, writable
 from demandops.cli.output import read_by
 from demandops.cli.target import all_names, names_of
+from demandops.decide.booking import Drain
+from demandops.decide.placement import relocation
+from demandops.decide.state import State
 from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
+from demandops.model.config.config import NODES_FILE
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.config.policy import matches
+from demandops.model.ledger.claim import LEDGER_ROOT
 from demandops.views.vocabulary import Json, override_data
 
 # ---- what the commands share: their options and selection ----
@@ -85,13 +96,13 @@ def override() -> None:
     """
 
 
-def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
-    if not is_override_name(name):
-        raise click.BadParameter(
-            f"{quoted(name)} is not a valid override name; use at most 63 lower-case letters, "
-            "digits and '-', with no '-' at the start or end"
-        )
-    return name
+def _new_name(name: str) -> str:
+    if is_override_name(name):
+        return name
+    raise ValueError(
+        f"{quoted(name)} is not a valid override name; use at most 63 lower-case letters, "
+        "digits and '-', with no '-' at the start or end"
+    )
 
 
 def _image(ctx: click.Context, param: click.Parameter, given: tuple[str, ...]) -> Json | None:
@@ -105,7 +116,7 @@ def _image(ctx: click.Context, param: click.Parameter, given: tuple[str, ...]) -
 
 
 @override.command()
-@click.argument("name", metavar="NAME", callback=_new_name)
+@click.argument("name", metavar="NAME", callback=read_by(_new_name))
 @selecting
 @click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
 @click.option("--deny", is_flag=True, help="Refuse demands, and stop what runs.")
@@ -231,9 +242,9 @@ def _path_of(name: str) -> str:
     return f"{OVERRIDES_ROOT}/{name}.yaml"
 
 
-def override_text(name: str, fields: dict[str, Any], note: str = "") -> str:
+def override_text(name: str, fields: dict[str, Any]) -> str:
     given = {key: value for key, value in fields.items() if value is not None}
-    return document(_path_of(name), "override", "Override", given, note)
+    return document(_path_of(name), "override", "Override", given)
 
 
 def _end(
@@ -249,7 +260,9 @@ def _end(
             message = f"there is no override '{name}'{suggestion(name, overrides)}"
             raise InvalidInput.at("", message)
         # a person may have changed what the file selects since it was suspended
-        if selected and not selects(override, selected):
+        selects = [select.model_dump(exclude_none=True).items() for select in override.select]
+        wanted = [{kind: {*values} for kind, values in selector(selected).items()}]
+        if selected and [{kind: {*own} for kind, own in select} for select in selects] != wanted:
             message = f"selects something else; to end it, run: demandops resume {name}"
             raise InvalidInput.at("select", message, file=_path_of(name))
         files, more = {override.path: None}, {"override": override_data(override)}
@@ -265,14 +278,6 @@ def name_of(selected: Mapping[str, tuple[str, ...]]) -> str:
     chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
     words = "-".join(value for _, values in chosen for value in values)
     return "suspend-" + naming.slug_with_hash(words, repr(chosen), 6)
-
-
-def selects(override: Override, selected: Mapping[str, tuple[str, ...]]) -> bool:
-    # another override may have the same name
-    selectors = [select.model_dump(exclude_none=True) for select in override.select]
-    return [{kind: {*values} for kind, values in select.items()} for select in selectors] == [
-        {kind: {*values} for kind, values in selector(selected).items()}
-    ]
 
 
 @click.command()
@@ -328,3 +333,121 @@ def resume(name: str | None, options: Options, **selected: tuple[str, ...]) -> N
         )
     summary = f"Resume {name or described(selected)}"
     _end(name or name_of(selected), summary, {} if name else selected, options)
+
+
+# ---- ``demandops drain`` and ``undrain``: the field `drained` of a node in the inventory ----
+
+
+def _set_drained(node: str, drained: bool, options: Options) -> None:
+    with writable(options) as repo:
+        config = repo.snapshot().state.config
+        if node not in config.nodes:
+            message = f"there is no node '{node}'{suggestion(node, config.nodes)}"
+            raise InvalidInput.at("NODE", message)
+        host, verb = config.host_of(node), "Drain" if drained else "Undrain"
+        if config.nodes[host].drained is drained:
+            raise StateRepoError(f"'{host}' is {'drained already' if drained else 'not drained'}")
+        path = config.file_of(NODES_FILE, host)
+        text = repo.file_reader()(path) or ""
+        try:
+            changed = strict_yaml.set_flag(text, "nodes", host, "drained", drained)
+        except InvalidInput as error:
+            raise InvalidInput(faults_in(error, path)) from None
+
+        def moves(before: State, after: State) -> tuple[Json, Iterator[str]]:
+            # the generator moves what it placed there, in commits of its own
+            plan = Drain(id=host)
+            if drained:
+                plan = relocation.with_moves(plan, after, after.usage(), after.names())
+            lines = [*(f"moves: {text}" for text in plan.moved), *plan.stays]
+            data = {"node": host, "moved": [*plan.moved], "stays": [*plan.stays]}
+            return data, (f"  {line}" for line in lines or ["moves nothing"])
+
+        summary, branch = f"{verb} {host}", f"{verb.lower()}/{host}"
+        person_change.commit(repo, {path: changed}, summary, branch, options, moves)
+
+
+_node = click.argument("node", metavar="NODE", shell_complete=names_of("nodes"))
+
+
+@click.command()
+@_node
+@editing
+def drain(node: str, options: Options) -> None:
+    """Take a node out of use: nothing new is placed there.
+
+    The command sets `drained: true` in the inventory. The generator then moves away what it placed
+    on the node. What a demand itself put on the node stays; `demandops release` or `demandops
+    decommission` ends that.
+
+    \b
+    Examples:
+      demandops drain edge --dry-run
+      demandops drain edge -m "Maintenance"
+    """
+    _set_drained(node, True, options)
+
+
+@click.command()
+@_node
+@editing
+def undrain(node: str, options: Options) -> None:
+    """Use a drained node again.
+
+    The command sets `drained: false` in the inventory. What was moved away stays where it is.
+
+    \b
+    Examples:
+      demandops undrain edge
+    """
+    _set_drained(node, False, options)
+
+
+# ---- ``demandops revert``: the files of a person's commit as they were before ----
+
+
+@click.command()
+@click.argument("commit", metavar="COMMIT")
+@editing
+def revert(commit: str, options: Options) -> None:
+    """Undo a person's commit, by a new commit.
+
+    The files that COMMIT changed become what they were before it. If a file has changed since, the
+    command changes nothing. A generator's commit is undone by `demandops release` or `demandops
+    rollback`, because later demands may build on it.
+
+    \b
+    Examples:
+      demandops revert 5d41402a --dry-run
+      demandops revert main -m "It was the wrong node"
+    """
+    with writable(options) as repo:
+        id = repo.commit(commit)
+        entry = next(repo.log(id))
+        demands = entry.trailers.get("Demand-Id", ())
+        paths = repo.files_changed_by(id)
+        booked = [
+            path for path in paths if path.split("/", 1)[0] in (LEDGER_ROOT, *GENERATED_ROOTS)
+        ]
+        if entry.by_generator or booked:
+            who = "a generator made it" if entry.by_generator else f"it changes {booked[0]}"
+            ways = [f"demandops release {shlex.quote(demand)}" for demand in demands]
+            if follows := entry.first("Follows"):  # it carries out what a person committed
+                ways.append(f"demandops revert {follows[:10]}")
+            ways.append(f"demandops rollback {id[:10]}~1 -m REASON")
+            message = (
+                f"{id[:10]} is not undone by a revert, because {who}; run: {' or '.join(ways)}"
+            )
+            raise StateRepoError(message)
+        before, after, now = (repo.file_reader(each) for each in (f"{id}~1", id, None))
+        if changed := [path for path in paths if now(path) != after(path)]:
+            message = f"has changed since commit {id[:10]}; revert it with git, and push"
+            raise InvalidInput.at("", message, file=changed[0])
+        files = {path: before(path) for path in paths}
+        summary = f'Revert "{entry.summary}"'
+        reason = f"This reverts commit {id}. {options.reason}".rstrip()
+        branch = f"revert/{id[:10]}"
+        more = {"reverts": id}
+        person_change.commit(
+            repo, files, summary, branch, replace(options, reason=reason), lambda *_: (more, ())
+        )
