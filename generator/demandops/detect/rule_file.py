@@ -137,7 +137,7 @@ class Goal:
 
     @property
     def document(self) -> Mapping[str, Any]:
-        """The goal in the form that a file for ``demandops request`` has."""
+        """The goal in the form that a file for ``demandops demand`` has."""
         return {**_HEAD, **self.data} if self.action == "Demand" else self.data
 
     def ended(self) -> Goal:

@@ -139,7 +139,7 @@ def _denied(source: Source) -> Iterator[Cause]:
             f"{'is needed' if needed else 'is booked'}, but {override.path} denies it",
             f"{override.owner}, who owns the override",
             f"remove the file by pull request{end}",
-            shlex.join(["git", "rm", override.path]),
+            shlex.join(["demandops", "override", "end", override.name]),
             change.time if change else None,
             told=override.reason,
             thing=thing,

@@ -10,6 +10,7 @@ minutes.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -112,7 +113,8 @@ def build(
 
 def module_folder(go: Go, workspace: Workspace, module: str) -> str:
     """Return the folder of a module's unpacked sources, which exist until `drop_modules`."""
-    return workspace.go(go, "list", "-mod=mod", "-m", "-f", "{{.Dir}}", module).strip()
+    # it fetches them again if an earlier build was interrupted after it had dropped them
+    return str(json.loads(workspace.go(go, "mod", "download", "-json", module))["Dir"])
 
 
 def _run(argv: list[str], folder: Path, own: dict[str, str]) -> str:

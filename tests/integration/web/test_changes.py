@@ -60,7 +60,7 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     (cause,) = causes(follower.newest)
     assert (cause.kind, cause.told) == ("suspended", "The road is closed")
     assert cause.who == "traffic-control, who owns the override"
-    assert cause.command == "git rm overrides/roadworks.yaml"
+    assert cause.command == "demandops override end roadworks"
     assert cause.requesters == ("station00", "vehicle01")
     changed = follower.newest.last_change("overrides/roadworks.yaml")
     assert changed and cause.since == changed.time

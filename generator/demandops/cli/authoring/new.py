@@ -316,7 +316,7 @@ def application(  # noqa: PLR0913 - as many as options
             f"{config.file_of(DOMAINS_FILE, domain.name)}"
         )
     then.append(
-        "when the files are on main, try the application: demandops request --dry-run "
+        "when the files are on main, try the application: demandops demand --dry-run "
         f"{directory / path}"
     )
     _write_files(directory, files, output, then)
@@ -447,7 +447,7 @@ def _example_demand(
         "applications": [{"id": f"{id}/{name}", "type": name, "node": id, "inputs": inputs}],
     }
     note = (
-        f"An example: demandops request {path}\n"
+        f"An example: demandops demand {path}\n"
         "`requesters` lists who demands this, by names that the rules of the access domain allow."
     )
     return document(path, "demand", "Demand", fields, note), bool(allowing or not rules)

@@ -193,6 +193,13 @@ def _meant(name: str, kinds: Iterable[str], state: State) -> str:
             command = "decommission" if kind in ("node", "requester") else "release"
             article = "an" if kind == "application" else "a"
             message = f"'{name}' is {article} {kind}; run: demandops {command} {shlex.quote(name)}"
+            demands = sorted({claim.demand for claim in ledger if name in claim.requesters})
+            if command == "decommission" and demands:
+                message = (
+                    f"'{name}' is {article} {kind}; to stop one demand, name it: "
+                    f"{fitted(', '.join(demands), 200)}; to release all that it holds, run: "
+                    f"demandops {command} {shlex.quote(name)}"
+                )
             raise InvalidInput.at("", message)
     return name
 
@@ -202,7 +209,7 @@ def _only(kind: str, other: str) -> Callable[..., Any]:
         f"--{kind}",
         "kind",
         flag_value=kind,
-        help=f"NAME is a {kind}, not a {other} of the same name.",
+        help=f"The name is that of the {kind}, not of the {other}.",
     )
 
 

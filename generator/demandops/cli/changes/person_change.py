@@ -98,8 +98,7 @@ def changing(
                 "--reason",
                 metavar="TEXT",
                 callback=lambda ctx, param, text: " ".join((text or "").split()),
-                help="The reason. It is written to the commit message and to the file of a new "
-                "override.",
+                help="The reason, for the commit message and for the file of an override.",
             ),
             *more,
             *([target.dry_run_option] if dry_run else []),
@@ -333,7 +332,8 @@ def approve(name: str, commit: str, options: Options) -> None:
     """
     if not commit and (options.yes or not sys.stdin.isatty()):
         raise click.UsageError(
-            "name the commit that you looked at: --commit ID; `demandops get proposals` lists it"
+            "name the commit that you looked at: --commit ID; `demandops get proposals -o wide` "
+            "has the whole command"
         )
     with writable(options) as repo:
         proposal = _proposal(repo, name, commit, options.output)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from dataclasses import asdict
 
@@ -130,10 +131,9 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
             yield f"    kept by {_override_text(claim['kept_by'])}"
             yield f"    to release it: {claim['release_by']} by pull request"
         else:
-            yield (
-                f"    to release it: {claim['release_by']}, or delete the claim's file by pull "
-                "request"
-            )
+            # the requester's way, and a person's
+            command = shlex.join(["demandops", "release", claim["demand"]])
+            yield f"    to release it: {claim['release_by']}, or run: {command}"
 
 
 def _override_text(override: Json) -> str:

@@ -105,7 +105,7 @@ def warnings(request: Demand, world: World) -> Iterator[str]:
     ]
     for claim in {claim.key: claim for claim in claims}.values():
         override = overrides.suspended_by(claim, world)
-        if override and {*request.requesters()} & {*claim.requesters}:
+        if override and {*claim.requesters} <= {*request.requesters()}:
             by = f"{override.path} of {override.owner}: {override.reason}"
             yield f"{claim.subject} is suspended by {by}"
 

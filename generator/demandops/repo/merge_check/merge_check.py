@@ -240,7 +240,7 @@ def _remedy(path: str, before: str | None, after: str | None, suggestion: Sugges
             )
         return (
             "is in a generated folder, from which the generator removes what no demand needs; "
-            "delete it, and demand what you need with `demandops request`"
+            "delete it, and demand what you need with `demandops demand`"
         )
     if root == BOOTSTRAP_ROOT:
         return f"{lost}, and change demandops.yaml, inventory/ or policy/ instead"
