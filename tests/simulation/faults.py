@@ -383,10 +383,12 @@ def start_without_overrides(first: Any, *given: Any) -> Any:
     return replace(found, state=replace(found.state, config=config))
 
 
-@wrong(1, snapshot, "ledger_at")
-def start_without_the_last_claim(read: Any, *given: Any) -> Any:
-    found, *more = read(*given)
-    return found.without([*found][-1:]), *more
+@wrong(1, snapshot, "_read_ledger")
+def start_without_the_last_claim(read: Any, repo: Any, before: Any, *given: Any) -> Any:
+    found = read(repo, before, *given)
+    if before is None:
+        found = found._replace(ledger=found.ledger.without([*found.ledger][-1:]))
+    return found
 
 
 _known = set[str]()
