@@ -278,7 +278,7 @@ def end_overrides_early_one_by_one(ends: Any, state: Any) -> Any:
 
 @wrong(0, Worker, "_publish_commits")
 def acknowledge_before_publishing(
-    publish: Any, worker: Any, commits: Any, results: Any, *more: Any
+    publish: Any, worker: Any, commits: Any, results: Any = (), *more: Any
 ) -> bool:
     worker._demands.answer([pair for pair in results if isinstance(pair[1], Receipt)])
     return publish(worker, commits, results, *more)
@@ -286,7 +286,7 @@ def acknowledge_before_publishing(
 
 @wrong(1, Worker, "_publish_commits")
 def refuse_before_publishing(
-    publish: Any, worker: Any, commits: Any, results: Any, *more: Any
+    publish: Any, worker: Any, commits: Any, results: Any = (), *more: Any
 ) -> bool:
     worker._demands.answer([pair for pair in results if isinstance(pair[1], InvalidInput)])
     return publish(worker, commits, results, *more)

@@ -24,7 +24,7 @@ from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import verification
 from demandops.repo.git import repository as repositories
 from demandops.repo.git import tree as trees
-from demandops.repo.git.remote_repository import connect, is_url
+from demandops.repo.git.remote_repository import Slot, connect, is_url
 from demandops.repo.git.repository import StateRepository, access_error, reading
 from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
@@ -33,7 +33,6 @@ from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.ledger_files import valid_claim_at
 from demandops.repo.load.snapshot import Problem, Progress, Snapshot
-from demandops.repo.slot import Slot
 from demandops.repo.verification import Verdict
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from demandops.base.errors import StateRepoError
-from demandops.repo.slot import Slot
+from demandops.repo.git.remote_repository import Slot
 from demandops.serve.journal import (
     DamagedJournal,
     Journal,
