@@ -365,7 +365,7 @@ class Demands:
             was_proposed = ticket.proposal is not None
             self._note(ticket, record)
             if not was_proposed:
-                self._leave(ticket)
+                self._of_requester -= Counter([ticket.requester])
             return _change(ticket, "proposed")
 
     def _note(self, ticket: Ticket, proposal: ProposalRecord | None) -> None:
@@ -479,7 +479,8 @@ class Demands:
                 # a proposed demand left the count of its requester already, and the end of a lease
                 # was never in it
                 if ticket.demand.operation != "expire" and ticket.proposal is None:
-                    self._leave(ticket)
+                    # it drops a requester at 0, so that passing vehicles leave nothing behind
+                    self._of_requester -= Counter([ticket.requester])
         for ticket, result in results:
             if isinstance(result, Receipt):
                 ticket.notify("pushed", f"pushed {result.commit}")
@@ -499,10 +500,6 @@ class Demands:
     def _enqueue(self, ticket: Ticket) -> None:
         self._of_requester[ticket.requester] += 1
         self._queue.append(ticket)
-
-    def _leave(self, ticket: Ticket) -> None:
-        # this difference drops a requester at 0, so that passing vehicles leave nothing behind
-        self._of_requester -= Counter([ticket.requester])
 
 
 def _change(ticket: Ticket, state: TicketState) -> bool:

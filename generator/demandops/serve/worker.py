@@ -70,7 +70,7 @@ class Worker:
         self._agenda = Agenda(fetch_interval, self._runtime, local=repository.on_this_disk)
         self._batch_limit = agenda.LIMIT_LOCAL if repository.always_current else agenda.LIMIT_REMOTE
         self._backoff = Backoff(self._batch_limit, self._runtime)
-        self._must_fetch = self._tip_is_fresh = False
+        self._tip_is_fresh = False
         self._refusal_patience_s = refusal_patience_s
         # the demand whose commit was refused alone, how often, and whether another was accepted
         self._suspect: Demand | None = None
@@ -163,14 +163,15 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         # also the demands that arrive during retries, and the ends of leases; the batch is empty
         # afterwards, unless an error is raised
-        self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
+        must_fetch = bool(self.remote.unreachable)
+        self._tip_is_fresh = self._repository.always_current
         self._suspect, self._leaves_due_work = None, False
         self._backoff.begin_anew()
         while batch or self._ended_leases(self.snapshot):
             self._heartbeat()
             self._require_not_ending()
             try:
-                wait = self._attempt(batch)
+                wait = self._attempt(batch, must_fetch)
             except Exception as failure:
                 reason = access_error(failure, self._repository.address, self._repository.objects)
                 if not isinstance(reason, Unavailable | PushDenied):
@@ -179,7 +180,6 @@ class Worker:
                 for ticket in batch:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
                 patience_s = self._refusal_patience_s - self._record_failure(reason)
-                self._tip_is_fresh = self._repository.always_current
                 wait = self._backoff.unreachable()
                 if isinstance(reason, Unavailable):
                     wait = max(wait, reason.retry_after_s)
@@ -189,7 +189,8 @@ class Worker:
                     self._demands.fail(batch, reason)
                     batch.clear()
                     return
-            if wait is None:
+            # fetch before a demand is committed, because after that it can no longer be withdrawn
+            if not (must_fetch := wait is not None):
                 continue
             # Wait before the fetch, not after it, because the push must follow the fetch closely.
             # Meanwhile tell the demands what they wait for.
@@ -212,12 +213,11 @@ class Worker:
                 f"{reason}; the demand stays in the journal and is resumed at the next start"
             )
 
-    def _attempt(self, batch: list[Ticket]) -> float | None:  # noqa: PLR0912
+    def _attempt(self, batch: list[Ticket], must_fetch: bool) -> float | None:  # noqa: PLR0912
         # the seconds to wait before the next attempt, or None to continue at once
-        # fetch before a demand is committed, because after that it can no longer be withdrawn
-        if self._must_fetch or self.remote.unreachable:
+        if must_fetch:
             self._repository.refresh()
-            self._must_fetch, self._tip_is_fresh = False, True
+            self._tip_is_fresh = True
         tip = self._repository.tip()
         results = self._published_before(str(tip), batch)
         booked = {ticket for ticket, _ in results}
@@ -275,7 +275,6 @@ class Worker:
         log.info("another writer was first; evaluating %d demands again", len(results))
         for ticket in part:
             ticket.mark_maybe_published(str(commits.start.commit))
-        self._must_fetch = True
         return self._backoff.overtaken(
             len(results), evaluated - began, self._runtime.monotonic() - evaluated
         )
@@ -467,7 +466,7 @@ class Worker:
             now = self._runtime.now()
             title, why = "Check that the server takes commits", "Why: it refused another commit."
             commit_without_files(commits, [[title], [why]], [("Operation", "follow")], now)
-        self._must_fetch = not self._publish_commits(commits)
+        self._publish_commits(commits)
         return None
 
     # ---- following the state repo ----

@@ -625,6 +625,8 @@ def commits_to_revert(repo: Repository, snapshot: Snapshot) -> list[str]:
 
 
 def how_to_mend(repo: Repository, snapshot: Snapshot) -> str:
+    if not snapshot.faults:
+        return ""
     commits = commits_to_revert(repo, snapshot)
     if not 0 < len(commits) <= _MOST_REVERTED:
         return "correct the files"
