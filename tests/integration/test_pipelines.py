@@ -169,6 +169,8 @@ def test_a_pipeline_checks_and_reports(scripts: list[str], checkout: Path, tmp_p
     told = (report / "report.md").read_text()
     assert told.startswith(f"{MARK}\n## DemandOps: 1 error")
     assert told == (summary.read_text() if summary.exists() else done.stdout)
+    git(checkout, "checkout", "--quiet", ".")
+    assert bash("\n".join(wanted), tmp_path, cwd=checkout, **names).returncode == 0
 
 
 @both
