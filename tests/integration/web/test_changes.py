@@ -24,12 +24,12 @@ from demandops.web.server import Site
 from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import DENY, VIEWS, Look, causes
+from tests.integration.web.html import Page
 from tests.kit import goals
 from tests.kit.config import override
-from tests.kit.generator import Proposed, book, running, wait_until
-from tests.kit.html import Page
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, Person, away, git
+from tests.kit.rig import Proposed, book, running, wait_until
 
 LINK = {"id": "vehicle02/cloud", "type": "mqtt", "source": "vehicle02", "target": "cloud"}
 LINK |= {"topics": [{"source": "/t"}]}

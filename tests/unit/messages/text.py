@@ -11,9 +11,9 @@ from demandops.base.errors import Fault, Refused
 from demandops.decide.state import State
 
 from tests.kit.connections import routes
+from tests.kit.forms import CONFIG_MODELS, GOAL_MODELS
 from tests.kit.goals import perception
 from tests.kit.memory import MemoryRepo
-from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS
 from tests.unit.connections import test_connection_types as of_connections
 from tests.unit.decide import test_override_mistakes as of_overrides
 from tests.unit.demand import test_refused as of_goals
