@@ -29,7 +29,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-processes test-nightly nightly test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs image wheel release clean
+.PHONY: help setup demo test test-processes test-nightly nightly steady test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs image wheel release clean
 .PHONY: $(SYSTEM) go
 
 help:  ## List the targets
@@ -78,6 +78,15 @@ test-nightly: system-test setup  ## Run the tests that `make test` leaves out, a
 
 nightly:  ## Make all that the gate (.ci/run) leaves out, each part timed; about an hour
 	@.ci/run nightly
+
+ROUNDS ?= 20
+steady: system-test setup  ## Run both in ROUNDS=20 shuffled orders while other work keeps all cores busy; two hours
+	@for core in $$(seq $$(nproc)); do $(PY) -c 'while True: pass' & busy="$$busy $$!"; done; \
+	trap 'kill $$busy' EXIT; \
+	for seed in $$(seq $(ROUNDS)); do \
+	  SHUFFLE=$$seed $(MAKE) -k --no-print-directory test test-processes || failed="$$failed $$seed"; \
+	done; \
+	[ -z "$$failed" ] || { echo "steady: failed with SHUFFLE =$$failed"; exit 1; }
 
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
 	@$(PY) -m pytest $(PACKAGE_TESTS)

@@ -16,7 +16,7 @@ from tests.experiment.bags import bag_tracks
 from tests.experiment.process_runner import path_in_pod
 from tests.experiment.routes import Way
 from tests.experiment.rules import Event, Near, Pose, causes, events_of, predicted
-from tests.kit.bag import write_bag
+from tests.kit.detection import write_bag
 
 NEAR = Near.read()
 GAP_S = 10.0

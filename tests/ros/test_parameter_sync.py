@@ -15,8 +15,8 @@ from demandops.base.errors import InvalidInput
 from demandops_ros.parameter_sync import parameters_of
 from rclpy.parameter import Parameter
 
+from tests.kit.cluster import KubeApi, kube_api
 from tests.kit.http import kubeconfig
-from tests.kit.kube_api import KubeApi, kube_api
 from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import Client, Served, Servers
 

@@ -15,9 +15,9 @@ from demandops.decide.state import State
 from tests.kit import plain_yaml
 from tests.kit.connections import decided, demand, routes
 from tests.kit.connections import state as with_nodes
+from tests.kit.forms import CONFIG_MODELS, GOAL_MODELS
 from tests.kit.goals import perception
 from tests.kit.memory import MemoryRepo
-from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS
 from tests.scenarios.running import configuration
 from tests.unit.demand import test_refused as of_goals
 from tests.unit.model.test_config_mistakes import MISTAKES, refused
