@@ -70,6 +70,18 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
         look(path)
 
 
+def test_an_application_that_others_demand_too_runs_on_without_a_suspended_requester(
+    booked: Generator, person: Person, follower: Follower, look: Look
+) -> None:
+    person.override(workshop=override({"requesters": ["vehicle00"]}, deny=True))
+    overridden(booked)
+    assert look("/").texts("h1") == ["1 thing needs attention"]
+    (cause,) = causes(follower.newest)
+    assert (cause.kind, cause.applications) == ("suspended", ())
+    page = look("/thing", kind="requester", name="vehicle00")
+    assert "kind=override&name=workshop" in page.link("workshop")
+
+
 def test_an_override_that_no_generator_carried_out_yet_is_told(bare: Path, state: GitRepo) -> None:
     with running(bare) as generator:
         book(generator, *(yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT[:2]))
@@ -231,8 +243,7 @@ def test_the_overview_has_the_fleet_in_figures(
         "3 requesters 3 unknown",
         "4 of 7 nodes used",
         "0 waiting",
-        "2 changes in the last hour 2 booked, 0 released in the last hour "
-        "2 booked, 0 released in the last day",
+        "2 changes in the last hour 2 booked, 0 released in the last day",
     ]
     book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
     person.override(roadworks=DENY)
