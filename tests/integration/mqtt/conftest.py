@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from tests.e2e.rig import pki
-from tests.kit.generator import wait_until
+from tests.kit.rig import wait_until
 from tests.kit.limits import PATIENCE_S
 
 USER = "fleet 007"
