@@ -18,8 +18,8 @@ import pytest
 import yaml
 
 from tests.e2e.rig import pki
-from tests.kit.rig import wait_until
 from tests.kit.limits import PATIENCE_S
+from tests.kit.rig import wait_until
 
 USER = "fleet 007"
 PASSWORD = "12345\"'{}#\\ é%"  # noqa: S105 - of a broker that lives as long as the test

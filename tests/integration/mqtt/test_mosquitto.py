@@ -17,8 +17,8 @@ import pytest
 from tests.e2e.rig import pki
 from tests.integration.mqtt.conftest import PASSWORD, USER, Broker, Client, Pod
 from tests.kit.connections import routes
-from tests.kit.rig import wait_until
 from tests.kit.memory import MemoryRepo
+from tests.kit.rig import wait_until
 
 DEMAND: dict[str, Any] = {
     "connections": [
