@@ -20,9 +20,9 @@ from pydantic import BaseModel, ValidationError
 
 from demandops.base.errors import InvalidInput, fault, field_path
 from demandops.base.quoting import quoted
-from demandops.model.config.base_model import faults_of
+from demandops.model.config.base_model import faults_of, matches
 from demandops.model.config.inventory import Node
-from demandops.model.config.policy import AccessDomain, matches
+from demandops.model.config.policy import AccessDomain
 
 Entry = TypeVar("Entry", bound=BaseModel)
 Value = TypeVar("Value")
