@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.integration import test_stories
 from tests.integration.repo.test_stories import STORIES
 from tests.scenarios import running
 
@@ -39,7 +40,11 @@ def test_a_test_that_a_page_names_exists(page: str) -> None:
     assert len(named) > 20
     missing = [name for file, name, _ in named if name not in names_in(ROOT / file)]
     assert missing == []
-    assert {case for _, _, case in named} - {""} <= {*running.scenarios(), *STORIES}
+    assert {case for _, _, case in named} - {""} <= {
+        *running.scenarios(),
+        *STORIES,
+        *test_stories.STORIES,
+    }
 
 
 def test_each_function_on_the_path_of_a_demand_exists() -> None:

@@ -37,6 +37,7 @@ from demandops.decide.planning.planner import denied_release, plan
 from demandops.decide.planning.release_keys import ReleaseKey, takes
 from demandops.decide.state import State
 from demandops.model.config.config import Config
+from demandops.model.config.inventory import Node
 from demandops.model.config.override import Override
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger, World, changes_on
@@ -46,20 +47,9 @@ from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Problem, Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
+from demandops.views.rows import RANKS
 
 # ---- the health of a release in one word ----
-
-# The words for a health, each with its color on the page, from the worst to the best health.
-WORDS = {
-    "failing": "bad",
-    "waiting": "busy",
-    "starting": "busy",
-    "unknown": "none",
-    "healthy": "good",
-}
-
-# The index of each word in `WORDS`; a lower index means worse health.
-RANKS = {word: float(place) for place, word in enumerate(WORDS)}
 
 
 def word_of(status: ReleaseStatus) -> str:
@@ -158,6 +148,13 @@ class Source:
         remedy = snapshots.how_to_mend(reader.objects, snapshot)
         own = reader.for_another_thread
         return cls(snapshot, entry, REAL.now(), own, problems, remedy, **more)
+
+    @property
+    def nodes(self) -> Mapping[str, Node]:
+        """The listed nodes, and those of patterns that claims need."""
+        known = self.config.nodes
+        used = self.state.ledger.indexed_names("node") if self.config.node_patterns else set()
+        return {**known, **{id: known[id] for id in used if id in known}}
 
     def taking_over(self, before: Source) -> Source:
         """Plan only what may differ from an earlier source; its other releases and rows are kept.
@@ -358,18 +355,3 @@ class Source:
     def unwatched(self) -> list[str]:
         used = {target.domain.cluster for _, target in self.targets}
         return sorted(used - self.watched)
-
-
-@dataclass(frozen=True, slots=True)
-class HealthChange:
-    time: datetime
-    release: str
-    before: str  # a word of `WORDS`, as `after` is
-    after: str
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Commit:
-    entry: LogEntry
-    roots: tuple[str, ...]  # the top-level files and folders that it changed

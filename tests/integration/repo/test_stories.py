@@ -20,8 +20,8 @@ from demandops.serve.generator import Generator
 
 from tests.kit import config, goals, plain_yaml, rig
 from tests.kit.clock import Clock
-from tests.kit.generator import Proposed
 from tests.kit.repo import GitRepo, Person, branches, read, state_of
+from tests.kit.rig import Proposed
 
 STORIES: dict[str, list[dict[str, Any]]] = {
     f"{path.stem}: {title}": steps

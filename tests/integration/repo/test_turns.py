@@ -9,7 +9,7 @@ from pathlib import Path
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
-from tests.kit.turns import Turns
+from tests.kit.clock import Turns
 
 
 def history(seed: int, template: Path, folder: Path) -> list[str]:
