@@ -99,7 +99,7 @@ def in_reverse(right: Wrong, *given: Any) -> Any:
 
 
 plant("let_strangers_change_a_demand", 1, permission, "stranger_faults", lambda *_: ())
-plant("release_only_the_first_claim", 34, booking, "claims_of", first_only)
+plant("release_only_the_first_claim", 28, booking, "claims_of", first_only)
 plant("replace_what_was_joined", 2, Claim, "extending", itself)
 plant("commit_what_is_booked_already", 6, Claim, "after_booking", itself)
 plant("grant_one_claim_too_many", 4, forbidden, "_held", lambda held, *given: held(*given) - 1)
@@ -124,25 +124,25 @@ def take_one_common_requester_for_the_owner(
     return () if owners & {*request.requesters()} else faults(request, owners, *more)
 
 
-@wrong(0, Claim, "without_topics")
+@wrong(6, Claim, "without_topics")
 def end_the_whole_claim_by_a_shutdown_of_some_topics(_: Any, claim: Any, gone: Any) -> None:
     return None
 
 
-@wrong(5, Lease, "started")
+@wrong(8, Lease, "started")
 def take_back_promised_leases(started: Any, lease: Any, now: Any, before: Any = None) -> Any:
     return started(lease, now)
 
 
-@wrong(2, Lease, "started")
+@wrong(0, Lease, "started")
 def lose_renewals(started: Any, lease: Any, now: Any, before: Any = None) -> Any:
     return before or started(lease, now)
 
 
-plant("end_leases_by_the_wall_clock", 11, Agenda, "_has_grace", lambda *_: False)
+plant("end_leases_by_the_wall_clock", 1, Agenda, "_has_grace", lambda *_: False)
 
 
-plant("never_scale", 8, planner, "_replicas_of", lambda _, scaling, *more: scaling.min)
+plant("never_scale", 1, planner, "_replicas_of", lambda _, scaling, *more: scaling.min)
 
 
 @wrong(0, planner, "_replicas_of")
@@ -165,7 +165,7 @@ def move_instances_with_the_channel(separated: Any, app: Any, config: Any) -> An
     return replace(separated(app, config), version=app.version)
 
 
-@wrong(127, completing, "_separated")
+@wrong(122, completing, "_separated")
 def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: Any) -> Any:
     made = separated(app, config)
     return made if made.separate else app
@@ -174,7 +174,7 @@ def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: An
 plant("take_the_first_domain", 3, Config, "nodes_of", lambda _, config, node: (node,))
 
 
-@wrong(14, completing, "_chosen")
+@wrong(13, completing, "_chosen")
 def forget_what_is_booked_in_a_domain(chosen: Any, one: Any, booked: Any, *more: Any) -> Any:
     return chosen(one, {}, *more)
 
@@ -187,7 +187,7 @@ def carry_only_the_first_demands_routes(topics: Any, claims: Any) -> Any:
     return topics([*claims][:1])
 
 
-@wrong(0, connection, "merged_routes")
+@wrong(1, connection, "merged_routes")
 def name_a_shared_route_twice(_: Any, routes: Any) -> Any:
     return tuple(sorted(routes, key=lambda one: one.source))
 
@@ -213,8 +213,8 @@ plant("leave_the_far_end", 0, ConnectionType, "keys", first_only)
 
 # ---- placement ----
 
-plant("let_the_last_in_first", 11, agenda, "in_turn", in_reverse)
-plant("ignore_priorities", 36, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
+plant("let_the_last_in_first", 13, agenda, "in_turn", in_reverse)
+plant("ignore_priorities", 18, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
 
 
 @wrong(13, decision, "_wait")
@@ -226,10 +226,10 @@ def begin_the_wait_anew(
 
 
 plant("forget_those_that_wait", 7, Agenda, "may_have_room", nothing)
-plant("let_others_overtake_in_a_batch", 7, Agenda, "book_those_let_in", nothing)
-plant("leave_drained_nodes_full", 9, agenda, "_to_drain", lambda *_: [])
-plant("place_on_drained_nodes", 12, Choice, "_closed", lambda *_: "")
-plant("choose_anew_for_a_placed_demand", 1, placement, "_booked", nothing)
+plant("let_others_overtake_in_a_batch", 44, Agenda, "book_those_let_in", nothing)
+plant("leave_drained_nodes_full", 19, agenda, "_to_drain", lambda *_: [])
+plant("place_on_drained_nodes", 13, Choice, "_closed", lambda *_: "")
+plant("choose_anew_for_a_placed_demand", 3, placement, "_booked", nothing)
 plant("count_no_room", 7, capacity, "excesses", lambda *_: [])
 
 
@@ -241,7 +241,7 @@ def count_released_room_as_taken(plus: Any, usage: Any, more: Any) -> Any:
 # ---- overrides ----
 
 
-@wrong(16, changeset, "plan_change")
+@wrong(8, changeset, "plan_change")
 def apply_no_override_to_what_a_demand_changes(
     plan: Any, before: Any, after: Any, *more: Any
 ) -> Any:
@@ -254,7 +254,7 @@ def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any
     return changeset.Changeset({**(more or {})}, ())
 
 
-plant("let_the_lowest_priority_win", 16, ledger, "by_rank", in_reverse)
+plant("let_the_lowest_priority_win", 26, ledger, "by_rank", in_reverse)
 
 
 @wrong(16, overrides, "fits")
@@ -262,17 +262,17 @@ def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bo
     return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
 
 
-plant("run_what_is_denied", 14, planner, "without_suspended", itself)
-plant("run_what_is_denied", 14, release_keys, "without_suspended", itself)
-plant("book_what_is_denied", 19, forbidden, "denial_faults", lambda *_: ())
+plant("run_what_is_denied", 5, planner, "without_suspended", itself)
+plant("run_what_is_denied", 5, release_keys, "without_suspended", itself)
+plant("book_what_is_denied", 0, forbidden, "denial_faults", lambda *_: ())
 
 
-@wrong(10, edits, "expired_overrides")
+@wrong(0, edits, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
 
 
-@wrong(10, agenda, "_ends")
+@wrong(0, agenda, "_ends")
 def end_overrides_early_one_by_one(ends: Any, state: Any) -> Any:
     return [(end - timedelta(minutes=2), name) for end, name in ends(state)]
 
@@ -327,7 +327,7 @@ def decide_on_a_stale_tip(attempt: Any, worker: Any, *given: Any) -> Any:
 plant("drop_what_a_batch_has_left", 0, Demands, "put_back", lambda *given: given[2].clear())
 
 
-@wrong(0, CommitBatch, "follow")
+@wrong(3, CommitBatch, "follow")
 def bring_back_what_was_deleted(follow: Any, batch: Any, followed: Any, now: Any) -> None:
     ledger, files = followed.snapshot.state.ledger, {}
     for claim in followed.before.state.ledger:
@@ -341,7 +341,7 @@ def bring_back_what_was_deleted(follow: Any, batch: Any, followed: Any, now: Any
         batch.commit_files(files, state, "Undo\n\nRender-Version: 3\n", author, now)
 
 
-@wrong(1, Approvals, "_receipt")
+@wrong(0, Approvals, "_receipt")
 def book_again_what_was_approved(
     receipt: Any, made: Any, ticket: Any, decision: Any, snapshot: Any, recorded: Any
 ) -> Receipt:
@@ -363,7 +363,7 @@ plant("turn_down_what_waits", 1, ProposalBranches, "put", lambda *_: "")
 plant("forget_the_journal", 3, journal, "read", lambda *_: {})
 
 
-@wrong(17, journal.Journal, "_write")
+@wrong(9, journal.Journal, "_write")
 def leave_the_journal_in_memory(write: Any, made: Any, records: Any, *, durably: bool) -> None:
     write(made, records, durably=False)
 
@@ -375,19 +375,19 @@ def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
 
 
 plant(
-    "resume_in_reverse", 51, journal, "read", lambda read, path: dict([*read(path).items()][::-1])
+    "resume_in_reverse", 15, journal, "read", lambda read, path: dict([*read(path).items()][::-1])
 )
-plant("skip_the_search_for_operations", 21, Worker, "_published_before", lambda *_: [])
+plant("skip_the_search_for_operations", 2, Worker, "_published_before", lambda *_: [])
 
 
-@wrong(17, snapshot, "start_at")
+@wrong(0, snapshot, "start_at")
 def start_without_overrides(first: Any, *given: Any) -> Any:
     found = first(*given)
     config = replace(found.state.config, overrides={})
     return replace(found, state=replace(found.state, config=config))
 
 
-@wrong(1, snapshot, "_read_ledger")
+@wrong(0, snapshot, "_read_ledger")
 def start_without_the_last_claim(read: Any, repo: Any, before: Any, *given: Any) -> Any:
     found = read(repo, before, *given)
     if before is None:
@@ -408,7 +408,7 @@ def _forget_proposal(read: Any, path: Any) -> dict[str, Ticket]:
     return found
 
 
-@wrong(3, permission, "approval")
+@wrong(0, permission, "approval")
 def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> Any:
     return ((), ()) if request.demand in _known else reasons(request, *more)
 
