@@ -7,7 +7,6 @@ It also checks the token, which is not in the recording.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -15,15 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.base.errors import InvalidInput
-from demandops.model.config.load import load
 from demandops.model.config.repo_settings import Proposals
-from demandops.repo.forge import Forge, ForgeError, Gitea, PullRequest, forge_for
+from demandops.repo.forge import Forge, ForgeError, PullRequest, forge_for
 from demandops.serve.proposal import ForgeWorker
 
 from tests.kit import plain_yaml
 from tests.kit.clock import Turns
-from tests.kit.config import configuration
 from tests.kit.http import Answer, Call, Server, serving
 
 TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
@@ -162,14 +158,6 @@ def test_the_token_follows_no_redirect(kind: str, token: Path) -> None:
     assert there.calls == []
 
 
-def test_a_forge_that_is_away_is_told(kind: str, token: Path) -> None:
-    with serving() as gone:
-        pass
-    with pytest.raises(ForgeError, match="refused") as error:
-        forge_at(kind, gone.url, token).find(BRANCH, "main")
-    assert error.value.status is None
-
-
 ODD = " must hold a token: one line of plain text"
 
 
@@ -223,20 +211,6 @@ def test_a_forge_that_is_asked_too_often_is_left_alone_for_a_minute(
         assert len(server.calls) == 2
 
 
-def test_a_forge_that_may_not_be_used_is_asked_again_at_the_usual_interval(token: Path) -> None:
-    denied = Answer.json({"message": "no"}, 403)
-    with asked(token, denied, "demand/x") as (turns, server, _):
-        turns.sleep(31)
-        assert len(server.calls) == 2
-
-
-def test_while_a_forge_is_away_no_requester_waits_for_the_calls_of_others(token: Path) -> None:
-    odd = Answer(200, b"<html>")
-    with asked(token, odd, "demand/x", "demand/y") as (turns, _, told):
-        turns.sleep(1)
-        assert told == [("demand/x", 1), ("demand/y", 1)]
-
-
 @pytest.mark.parametrize(("kind", "url", "address"), TABLES["addresses"])
 def test_the_apis_address_follows_from_the_projects(
     kind: str, url: str, address: str, token: Path
@@ -249,23 +223,3 @@ def test_the_apis_address_follows_from_the_projects(
 def test_forges_without_an_api_are_asked_nothing() -> None:
     for name in ("none", "gitlab"):
         assert forge_for(Proposals.model_validate({"forge": name}), None) is None
-
-
-@pytest.mark.parametrize(("section", "message"), TABLES["sections"])
-def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> None:
-    config = configuration()
-    config["demandops.yaml"] += f"\nproposals: {section}\n"
-    with pytest.raises(InvalidInput) as error:
-        load(config)
-    faults = [str(found) for found in error.value.faults]
-    assert any(message in found for found in faults), faults
-
-
-@pytest.mark.parametrize(
-    ("number", "link"), [("1e999", "https://x"), ("null", "https://x"), ("1", r"https://x\nA: b")]
-)
-def test_an_answer_with_an_odd_number_or_link_is_no_pull_request(number: str, link: str) -> None:
-    answer = f'{{"number": {number}, "html_url": "{link}", "merged": false, "state": "open"}}'
-    message = "https://x: the answer is not a pull request; check that this is the address of Gitea"
-    with pytest.raises(ForgeError, match=message):
-        Gitea("https://x", "token", "owner", "name")._read(json.loads(answer))
