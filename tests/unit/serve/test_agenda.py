@@ -181,38 +181,23 @@ def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) ->
     assert remote.status.push_denied == ""
 
 
-class Sending:
-    """Sends demands to a rate limit of two a minute."""
+def test_a_rate_limit_counts_a_hand_in_once_and_forgets_who_sends_no_more() -> None:
+    quotas = "    quotas: {demandsPerMinute: 2}\n    namespace:"
+    config = load(configuration(edited("policy/access-domains.yaml", "    namespace:", quotas)))
+    throttle, names = RateLimit(), map(str, count())
 
-    def __init__(self) -> None:
-        self.throttle = RateLimit()
-        quotas = "    quotas: {demandsPerMinute: 2}\n    namespace:"
-        policy = edited("policy/access-domains.yaml", "    namespace:", quotas)
-        self._config = load(configuration(policy))
-        self._names = map(str, count())
-
-    def send(self, requester: str, at_s: float, operation: str = "") -> bool:
-        """Send a demand; return whether the limit allowed it."""
+    def allows(requester: str, at_s: float, operation: str = "") -> bool:
         app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
         request = Demand("join", "one", (Item(app, (requester,)),))
-        moment, name = NOW + timedelta(seconds=at_s), operation or next(self._names)
-        return not list(self.throttle.faults(request, self._config, name, moment))
+        moment, name = NOW + timedelta(seconds=at_s), operation or next(names)
+        return not list(throttle.faults(request, config, name, moment))
 
-
-def test_a_hand_in_that_is_judged_again_counts_once() -> None:
-    sending = Sending()
-    assert [sending.send("vehicle00", 0, "same") for _ in range(5)] == [True] * 5
-    assert sending.send("vehicle00", 1)
-    assert not sending.send("vehicle00", 2)
-
-
-def test_who_sends_no_more_is_forgotten() -> None:
-    sending = Sending()
+    assert [allows("a", 0, "judged again") for _ in range(5)] == [True] * 5
+    assert (allows("a", 1), allows("a", 2)) == (True, False)
     for number in range(500):
-        assert sending.send(f"vehicle{number}", number)
-    assert len(sending.throttle._seen) <= 62
-    assert sending.send("vehicle499", 499.5)
-    assert not sending.send("vehicle499", 499.6)
+        assert allows(f"vehicle{number}", 10 + number)
+    assert len(throttle._seen) <= 62
+    assert (allows("vehicle499", 509.5), allows("vehicle499", 509.6)) == (True, False)
 
 
 def leased(*terms: tuple[str, int, int]) -> Ledger:
