@@ -29,7 +29,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-processes test-nightly nightly test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs image wheel release clean
+.PHONY: help setup demo test test-processes test-nightly nightly steady test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs image wheel release clean
 .PHONY: $(SYSTEM) go
 
 help:  ## List the targets
@@ -79,6 +79,15 @@ test-nightly: system-test setup  ## Run the tests that `make test` leaves out, a
 nightly:  ## Make all that the gate (.ci/run) leaves out, each part timed; about an hour
 	@.ci/run nightly
 
+ROUNDS ?= 20
+steady: system-test setup  ## Run both in ROUNDS=20 shuffled orders while other work keeps all cores busy; two hours
+	@for core in $$(seq $$(nproc)); do $(PY) -c 'while True: pass' & busy="$$busy $$!"; done; \
+	trap 'kill $$busy' EXIT; \
+	for seed in $$(seq $(ROUNDS)); do \
+	  SHUFFLE=$$seed $(MAKE) -k --no-print-directory test test-processes || failed="$$failed $$seed"; \
+	done; \
+	[ -z "$$failed" ] || { echo "steady: failed with SHUFFLE =$$failed"; exit 1; }
+
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
 	@$(PY) -m pytest $(PACKAGE_TESTS)
 
@@ -120,8 +129,8 @@ e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONF
 
 # With FIGURES=1 the target also draws the plots of the docs: docs/figures
 experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
-experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (tests/experiment/README.md)
-	@$(PY) -m tests.experiment $(EXPERIMENT)
+experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (examples/experiment/full/README.md)
+	@$(PY) -m examples.experiment.full $(EXPERIMENT)
 
 check: system-test setup  ## Format, lint, types, imports, docs, test, test-processes and test-packages
 	@$(PY) -m ruff format --check .

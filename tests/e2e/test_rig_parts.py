@@ -21,8 +21,8 @@ from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Kube
 from tests.e2e.rig.processes import Component, Processes
 from tests.e2e.rig.workdir import Workdir
-from tests.kit.generator import wait_until
 from tests.kit.http import kubeconfig, running
+from tests.kit.rig import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
+from examples.experiment.full import fleet, report, routes
+from examples.experiment.full.checks import checks
+from examples.experiment.full.measures import savings, steps
+from examples.experiment.full.outcome import Formed, Outcome, Settings
+from examples.experiment.full.participants import EGO_DATA
+from examples.experiment.full.process_runner import Container, RunningPod
+from examples.experiment.full.rules import Near, events_of
 from tests.e2e.common.expected import DETECTION, FUSION, source_end, target_end
-from tests.experiment import fleet, report, routes
-from tests.experiment.checks import checks
-from tests.experiment.measures import savings, steps
-from tests.experiment.outcome import Formed, Outcome, Settings
-from tests.experiment.participants import EGO_DATA
-from tests.experiment.process_runner import Container, RunningPod
-from tests.experiment.rules import Near, events_of
 
 from .test_routes import drive
 

@@ -9,10 +9,10 @@ import pytest
 from demandops.detect import rule_file
 from demandops.detect.rule_file import RuleFile
 
-from tests.experiment import crowd, report, routes
-from tests.experiment.measures import savings
-from tests.experiment.outcome import Formed, Outcome, Settings
-from tests.experiment.rules import Near, predicted
+from examples.experiment.full import crowd, report, routes
+from examples.experiment.full.measures import savings
+from examples.experiment.full.outcome import Formed, Outcome, Settings
+from examples.experiment.full.rules import Near, predicted
 
 COUNT, OVER = 12, 60.0
 NEAR = Near.read()

@@ -11,12 +11,12 @@ from demandops.detect import rule_file
 from rosbags.rosbag2 import StoragePlugin
 
 from examples.experiment import paper
-from tests.experiment import fleet, routes
-from tests.experiment.bags import bag_tracks
-from tests.experiment.process_runner import path_in_pod
-from tests.experiment.routes import Way
-from tests.experiment.rules import Event, Near, Pose, causes, events_of, predicted
-from tests.kit.bag import write_bag
+from examples.experiment.full import fleet, routes
+from examples.experiment.full.bags import bag_tracks
+from examples.experiment.full.process_runner import path_in_pod
+from examples.experiment.full.routes import Way
+from examples.experiment.full.rules import Event, Near, Pose, causes, events_of, predicted
+from tests.kit.detection import write_bag
 
 NEAR = Near.read()
 GAP_S = 10.0

@@ -41,7 +41,7 @@ from demandops_ros import messages
 from hypothesis import strategies as st
 
 from tests.fuzz import Target
-from tests.kit import golden, plain_yaml, rich
+from tests.kit import forms, golden, plain_yaml
 from tests.kit.cluster import Letters
 from tests.kit.config import state_of
 from tests.kit.goals import EXPERIMENT
@@ -108,7 +108,7 @@ def goal_as_data(data: Any) -> None:
 
 
 def _goals() -> st.SearchStrategy[Any]:
-    models = [rich.reference_goal(), rich.own_goal()]
+    models = [forms.reference_goal(), forms.own_goal()]
     return st.one_of(ANYTHING, *(_near(model, ANYTHING | TEXT) for model in models))
 
 
@@ -152,7 +152,7 @@ def data_to_ros_message(data: Any) -> None:
 
 # ---- files of the state repo ----
 
-_CONFIG = rich.rich()
+_CONFIG = forms.rich()
 _FILES = sorted(path for path in _CONFIG if "/charts/" not in path and "/values/" not in path)
 _CHARTS = sorted(path for path in _CONFIG if "/charts/" in path or "/values/" in path)
 
@@ -429,7 +429,7 @@ TARGETS = (
     Target(ros_message, values=st.one_of(map(_message, (Demand.Goal, DeploymentRequest.Goal)))),
     Target(
         data_to_ros_message,
-        values=_near(rich.own_goal(), ANYTHING) | st.dictionaries(KEY, ANYTHING),
+        values=_near(forms.own_goal(), ANYTHING) | st.dictionaries(KEY, ANYTHING),
         expected=(ValueError, TypeError, AssertionError, AttributeError, OverflowError),
     ),
     Target(config_file, _seeds_of(_FILES)),

@@ -34,7 +34,7 @@ from demandops.serve import proposal
 from hypothesis import strategies as st
 
 from tests.fuzz import Target
-from tests.kit import rich
+from tests.kit import forms
 from tests.kit.config import state_of
 from tests.kit.memory import NOW, MemoryRepo
 from tests.kit.plain_yaml import FAST
@@ -89,7 +89,7 @@ def claim_in_its_file(claim: Any) -> None:
 def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
     """Return a rich configuration and a goal in which the given texts replace some texts."""
     seed, texts = given
-    random, files, goal = Random(seed), rich.rich(), rich.own_goal()
+    random, files, goal = Random(seed), forms.rich(), forms.own_goal()
     name = random.choice([path for path in files if path.startswith(("inventory", "registry"))])
     data = _yaml(files[name])
     renamed = {old: random.choice(texts) for old in ("vehicle00", "edge") if random.random() < 0.3}

@@ -20,11 +20,11 @@ from demandops.repo.reader import Reader
 from demandops.views.kinds import KINDS
 
 from tests.integration.conftest import On
+from tests.kit.cli import terminal
+from tests.kit.cluster import kube_api
 from tests.kit.goals import EXPERIMENT, put
 from tests.kit.http import kubeconfig
-from tests.kit.kube_api import kube_api
 from tests.kit.repo import GitRepo
-from tests.kit.terminal import terminal
 
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 NOBODY = "http://127.0.0.1:9"

@@ -27,7 +27,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.e2e.rig import tools
-from tests.kit import greedy_helm
+from tests.integration import greedy_helm
 from tests.kit.chance import examples
 from tests.kit.cli import Ran
 from tests.kit.http import Server, serving

@@ -401,7 +401,7 @@ def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Run) -> 
     (branch / EDGE / "a&<b>`.yaml").write_text("x")
     ran = check("--output", "markdown")
     assert ran.code == 1
-    assert f"`````requester {evil}`````" in ran.out
+    assert f"    + requester {evil}\n`````" in ran.out
     outside = without_code(ran.out)
     for mark in ("@", "javascript", "http:", "<b>", "]("):
         assert mark not in outside
@@ -436,8 +436,8 @@ def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Run
     assert ran.code == 0
     assert len(ran.out) <= LONGEST == 60_000
     assert ran.out.startswith(f"{MARK}\n## DemandOps: valid")
-    assert "Releases: 3 to change." in ran.out
-    assert "\n3 parts of this report are left out because " in ran.out[-200:]
+    assert "~ od-edge-station00" in ran.out and "\n…\n" in ran.out
+    assert "\nParts cut or left out, because a comment has a limited length: " in ran.out[-200:]
 
 
 # ---- what main has become meanwhile ----

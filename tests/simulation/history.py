@@ -17,11 +17,11 @@ from demandops.serve.agenda import LONGEST_WAIT_S
 
 from tests.kit import plain_yaml, repo
 from tests.kit.config import texts_below
-from tests.kit.promises import Maker, name_of
 from tests.kit.repo import GitRepo
 from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
 from tests.model.leases import Goal
 from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
+from tests.simulation.promises import Maker, name_of
 from tests.simulation.world import World
 
 STEPS = 30

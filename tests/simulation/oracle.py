@@ -23,10 +23,10 @@ from demandops.repo.history.commit_message import PROPOSAL
 from demandops.serve.journal import Ticket
 
 from tests.kit import plain_yaml
-from tests.kit.promises import claims_of, name_of
 from tests.model.instances import FURTHER, NEXT
 from tests.model.leases import Goal, Subject
 from tests.model.running import Link, Override, Running, Service
+from tests.simulation.promises import claims_of, name_of
 from tests.simulation.world import Machine, World
 
 SLACK_S = 30

@@ -26,7 +26,7 @@ from demandops.serve import generator
 from demandops.serve.generator import Generator
 from greenlet import getcurrent
 
-from tests.kit.turns import Turns
+from tests.kit.clock import Turns
 
 FETCH_INTERVAL_S = 30.0
 _JOURNAL = "outbox.jsonl"

@@ -39,6 +39,7 @@ class Mqtt(ConnectionType):
     takes_broker = True
     speaks_dds = False
     one_derived_route = True
+    channel = "MQTT channel"
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
         if config.brokers and reader.is_missing(configs.IMAGES_FILE, self.image):
@@ -76,11 +77,6 @@ class Mqtt(ConnectionType):
     def broker_node(self, connection: Connection, config: Config) -> str:
         broker = choose_broker(connection, config)
         return broker.node if broker else ""
-
-    def names(self, key: ClientKey) -> Iterator[tuple[str, str]]:
-        yield from ConnectionType.names(self, key)
-        if key.side == "source":  # both ends share the channel
-            yield "MQTT channel", naming.object_name(self.word, key.id)
 
     def client(
         self, key: ClientKey, connections: routes.Connections, config: Config

@@ -26,9 +26,9 @@ from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.release_keys import claims_needing
 from demandops.decide.state import State
 from demandops.model.config.appdef import ignored_fields
+from demandops.model.config.base_model import matches
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.override import Override
-from demandops.model.config.policy import matches
 from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
@@ -290,7 +290,7 @@ def request_warnings(config: Config) -> Iterator[Fault]:
                     + config.place_of(NODES_FILE)
                 )
                 yield fault(f"{place}.{name}", message).within(service.file)
-            if resource and not settings.requests_of_pods({name: amount}):
+            if resource and resource not in service.pod_requests:
                 message = (
                     f"'{name}' is no resource of Kubernetes, so only the generator counts it; name "
                     "it in 'resources' of demandops.yaml, with Kubernetes' name or with null"
@@ -299,7 +299,7 @@ def request_warnings(config: Config) -> Iterator[Fault]:
                     message = f"pods do not get {known}, because Kubernetes gives only whole ones"
                     message += "; write a whole number"
                 yield fault(f"{place}.{name}", message).within(service.file)
-        chart, template = config.charts.get(service.chart), config.values_template(service)
+        chart, template = config.charts.get(service.chart), service.values
         if not service.requests or chart is None or "requests" in config.files.get(template, ""):
             continue
         with suppress(InvalidInput):  # YAML that only Helm reads

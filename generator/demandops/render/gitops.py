@@ -14,7 +14,7 @@ from typing import Any
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput, Refused
 from demandops.base.settings import MAIN_BRANCH
-from demandops.connections.connection import UNSUPPORTED, Client
+from demandops.connections.connection import UNSUPPORTED
 from demandops.model.config.config import IMAGES_FILE, Config
 from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.override import format_time
@@ -103,21 +103,52 @@ def render(release: Release, config: Config, evaluate: Evaluate) -> str:
 
     Helm values and the plain manifests of connections are the same for Flux and Argo CD.
     """
-    if not isinstance(release, ServiceRelease):
-        return render_connection(release, config)
-    values, chart = values_of(release, config, evaluate), release.chart
-    repository = config.repo_settings
+    if isinstance(release, ServiceRelease):
+        values, chart = values_of(release, config, evaluate), release.chart
+        repository = config.repo_settings
+        return engine.text(
+            f"{repository.gitops}/release.yaml.j2",
+            release=release,
+            chart=chart,
+            chart_kind="OCIRepository" if chart.oci else "HelmChart",
+            chart_name=chart_object(release.service.chart, chart),
+            values=values,
+            project=project_of(release.domain, repository),
+            repository=repository,
+            branch=MAIN_BRANCH,
+            server=IN_CLUSTER,
+        )
+    # The file of a client: a Deployment, and a ConfigMap with its configuration. Each type of
+    # connection has a template and a schema in ``templates/connections/<type>/``. The schema lists
+    # the fields that the client's program reads; tests compare configurations with it.
+    kind, node = release.type, release.node
+    if kind.image not in config.images:
+        message = (
+            f"'{kind.image}' is in use, but not in {config.place_of(IMAGES_FILE)}; add it there"
+        )
+        raise Refused.at("images", message, code=UNSUPPORTED)
+    configuration, settings = release.configuration(), release.settings(config)
+    # A client reads these fields only at its start. Their checksum is an annotation of the pod, so
+    # that a change of them restarts the pod, and a change of other fields does not.
+    at_start = {name: configuration[name] for name in configuration if name not in release.reread}
     return engine.text(
-        f"{repository.gitops}/release.yaml.j2",
-        release=release,
-        chart=chart,
-        chart_kind="OCIRepository" if chart.oci else "HelmChart",
-        chart_name=chart_object(release.service.chart, chart),
-        values=values,
-        project=project_of(release.domain, repository),
-        repository=repository,
-        branch=MAIN_BRANCH,
-        server=IN_CLUSTER,
+        f"connections/{kind.word}/client.yaml.j2",
+        client=release,
+        configuration=release.written(configuration),
+        checksum=hashlib.sha256(release.written(at_start).encode()).hexdigest(),
+        node=node,
+        selector=node.labels,
+        tolerations=[item.model_dump(exclude_defaults=True) for item in node.tolerations],
+        settings=settings,
+        env=release.environment(settings) | settings.env,
+        probes={
+            f"{name}Probe": probe
+            for name in ("startup", "readiness", "liveness")
+            if (probe := getattr(settings, f"{name}_probe"))
+        },
+        resources=settings.resources.model_dump(),
+        host_network=node.host_network if settings.host_network is None else settings.host_network,
+        image=release.shaping.image(kind.image, config.images[kind.image]).reference(),
     )
 
 
@@ -132,7 +163,7 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
 
     InvalidInput names the template, the schema or the override at fault.
     """
-    template = config.values_template(release.service)
+    template = release.service.values
     if release.autoscaler and release.autoscaler.max == 0:
         by = [each.path for each, effects in release.shaping.by if "replicas" in effects]
         # seen on a cluster: the 0 stayed when the override ended, as no autoscaler starts from 0
@@ -146,7 +177,7 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
         "service": release.key.service,
         "node": {
             "id": node.id,
-            "selector": node.labels(),
+            "selector": node.labels,
             "tolerations": [item.model_dump(exclude_defaults=True) for item in node.tolerations],
             "image_pull_secrets": list(node.image_pull_secrets),
             "host_network": node.host_network,
@@ -168,7 +199,7 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
         },
         "outputs": dict(release.outputs),
         "parameters": dict(release.parameters),
-        "requests": config.repo_settings.requests_of_pods(release.service.requests),
+        "requests": release.service.pod_requests,
         "images": {name: release.image(name, config).parts() for name in release.service.images},
     }
     # Never both. A template that knows only ``replicas`` must fail, because the GitOps controller
@@ -197,44 +228,6 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
             for fault in error.faults
         )
         raise type(error)(faults) from None
-
-
-# ---- the file of a communication client: a Deployment, and a ConfigMap with its configuration ----
-#
-# Each connection type has a template and a schema in ``templates/connections/<type>/``. The schema
-# lists the fields that the client program reads; tests compare configurations with it.
-
-
-def render_connection(client: Client, config: Config) -> str:
-    kind, node = client.type, client.node
-    if kind.image not in config.images:
-        message = (
-            f"'{kind.image}' is in use, but not in {config.place_of(IMAGES_FILE)}; add it there"
-        )
-        raise Refused.at("images", message, code=UNSUPPORTED)
-    configuration, settings = client.configuration(), client.settings(config)
-    # A client reads these fields only at its start. Their checksum is an annotation of the pod, so
-    # that a change of them restarts the pod, and a change of other fields does not.
-    at_start = client.written(client.read_at_start(configuration))
-    return engine.text(
-        f"connections/{kind.word}/client.yaml.j2",
-        client=client,
-        configuration=client.written(configuration),
-        checksum=hashlib.sha256(at_start.encode()).hexdigest(),
-        node=node,
-        selector=node.labels(),
-        tolerations=[item.model_dump(exclude_defaults=True) for item in node.tolerations],
-        settings=settings,
-        env=client.environment(settings) | settings.env,
-        probes={
-            f"{name}Probe": probe
-            for name in ("startup", "readiness", "liveness")
-            if (probe := getattr(settings, f"{name}_probe"))
-        },
-        resources=settings.resources.model_dump(),
-        host_network=node.host_network if settings.host_network is None else settings.host_network,
-        image=client.shaping.image(kind.image, config.images[kind.image]).reference(),
-    )
 
 
 def kept_charts(

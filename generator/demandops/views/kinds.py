@@ -23,7 +23,8 @@ from demandops.decide.bookkeeping import (
 from demandops.decide.planning.overrides import suspended_by
 from demandops.model.config.base_model import duration_text, parse_time, relative
 from demandops.model.config.config import DOMAINS_FILE
-from demandops.model.ledger.claim import Claim, requesters_of
+from demandops.model.config.override import OVERRIDES_ROOT
+from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
@@ -210,20 +211,14 @@ def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> list[str]:
 # ---- what is held: demands, applications, claims, leases and requesters ----
 
 
-def _state(source: Source, claims: Sequence[Claim]) -> str:
-    # A claim is held by its demand, kept by an override, or suspended by an override. What has
-    # claims in several states is partly suspended.
-    states = {
-        "suspended"
-        if suspended_by(claim, source.state)
-        else "kept"
-        if claim.keeping_override
-        else "held"
-        for claim in claims
-    }
-    (state,) = states if len(states) == 1 else ("partly suspended",)
-    is_over = any(claim.lease and claim.lease.has_ended(source.now) for claim in claims)
-    return "overdue" if state == "held" and is_over else state
+def state_of(source: Source, claims: Sequence[Claim]) -> str:
+    # a claim is held by its demand, kept by an override, or suspended by an override
+    active = [claim for claim in claims if not suspended_by(claim, source.state)]
+    if len(active) < len(claims):
+        return "partly suspended" if active else "suspended"
+    if any(claim.lease and claim.lease.has_ended(source.now) for claim in claims):
+        return "overdue"
+    return "kept" if all(claim.keeping_override for claim in claims) else "held"
 
 
 def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
@@ -246,7 +241,7 @@ def _demands(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     held = source.claims_of_demands.items()
     for id, claims in sorted(held, key=lambda pair: (min(c.booked for c in pair[1]), pair[0])):
         runs = _runs(source, source.releases_of_demands.get(id, []))
-        yield id, (claims, _state(source, claims), runs)
+        yield id, (claims, state_of(source, claims), runs)
     for waiting in source.state.ledger.waiting.values():
         yield f"waiting {waiting.demand}", (waiting, "waiting", {"releases": [], "health": None})
 
@@ -290,7 +285,7 @@ def _applications(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     ledger = source.state.ledger
     for id in ledger.subjects(SubjectKind.APPLICATION):
         claims = ledger.application_claims(id)
-        yield id, (claims, _state(source, claims), _runs(source, releases[id]))
+        yield id, (claims, state_of(source, claims), _runs(source, releases[id]))
 
 
 def _application(source: Source, claims: tuple[Claim, ...], state: str, runs: Json) -> Json:
@@ -308,12 +303,36 @@ def _application(source: Source, claims: tuple[Claim, ...], state: str, runs: Js
 
 def _claims(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     for claim in sorted(source.state.ledger, key=lambda claim: (str(claim.subject), claim.demand)):
-        yield f"{claim.subject} {claim.demand}", (claim, _state(source, [claim]))
+        yield f"{claim.subject} {claim.demand}", (claim, state_of(source, [claim]))
 
 
-def _claim(source: Source, claim: Claim, state: str) -> Json:
-    data = claim_data(claim)
-    return {"name": data["file"], **_held(source, [claim], state), **data}
+def claim_item(source: Source, claim: Claim, state: str) -> Json:
+    data, denying = claim_data(claim), suspended_by(claim, source.state)
+    kept = source.config.overrides.get(claim.keeping_override or "")
+    way = f"send request '{claim.request}' again with shutdown: true"
+    if claim.keeping_override is not None:
+        way = f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
+    elif is_released_by_demand_id(claim):
+        way = f"send 'operation: release' for demand '{claim.demand}'"
+    return {
+        "name": data["file"],
+        **_held(source, [claim], state),
+        **data,
+        "release_by": way,
+        "kept_by": vocabulary.override_data(kept, ("keep",)) if kept else None,
+        "suspended_by": vocabulary.override_data(denying, ("deny",)) if denying else None,
+    }
+
+
+def is_released_by_demand_id(claim: Claim) -> bool:
+    # A goal of the reference's action has no demand id. The generator derives it from the request.
+    is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
+    return claim.keeping_override is None and not is_of_a_request
+
+
+def _suspending(item: Json, now: datetime) -> list[str]:
+    override = item["suspended_by"]
+    return [override["name"]] if override else []
 
 
 def _subject(item: Json, now: datetime) -> list[str]:
@@ -346,7 +365,7 @@ def _requesters(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
                 for name in source.releases_of_demands.get(demand, ())
             }
         )
-        state = _state(source, claims) if claims else "waiting"
+        state = state_of(source, claims) if claims else "waiting"
         yield requester, (requester, claims, state, waiting[requester], _runs(source, releases))
 
 
@@ -373,6 +392,11 @@ def _releases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
         name = planned.target.name
         status = source.status(name) if source.statuses else None
         yield name, (planned.release, planned.claims, status)
+
+
+def release_of(source: Source, release: Release) -> Json:
+    status = source.status(release.name) if source.statuses else None
+    return _release(source, release, source.claims_of_releases[release.name], status)
 
 
 def _services(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -594,11 +618,7 @@ def _events(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 
 def event(entry: LogEntry) -> Json:
-    data = vocabulary.commit_data(entry)
-    who = ", ".join(data["requesters"]) or data["author"]
-    if data["operation"] in ("rollback", "reject"):  # a person did it to what others hold
-        who = f"{data['author']}, for {', '.join(data['requesters'])}"
-    return {"name": entry.commit, **data, "who": who}
+    return {"name": entry.commit, **vocabulary.commit_data(entry)}
 
 
 def _told(commit: Json, now: datetime) -> str:
@@ -754,12 +774,13 @@ KINDS: dict[str, Kind] = {
             "claims",
             "What one demand holds of one subject.",
             (
-                *(Column("subject", "Subject", texts_of=_subject), STATE, REQUESTERS),
+                *(Column("subject", "Subject", texts_of=_subject, links="held"), STATE, REQUESTERS),
                 *(Column("demand", "Demand", 3, links="demand"), LEASE, SINCE),
+                Column("suspended_by", "Suspended by", 7, texts_of=_suspending, links="override"),
                 *(_wide("request", "Request"), _wide("file", "File")),
             ),
             _claims,
-            _claim,
+            claim_item,
             lambda item: {
                 item["subject"]["kind"]: [item["subject"]["id"]],
                 "kind": [item["subject"]["kind"]],

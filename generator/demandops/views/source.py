@@ -45,20 +45,9 @@ from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.snapshot import Problem, Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
+from demandops.views.rows import RANKS
 
 # ---- the health of a release in one word ----
-
-# The words for a health, each with its color on the page, from the worst to the best health.
-WORDS = {
-    "failing": "bad",
-    "waiting": "busy",
-    "starting": "busy",
-    "unknown": "none",
-    "healthy": "good",
-}
-
-# The index of each word in `WORDS`; a lower index means worse health.
-RANKS = {word: float(place) for place, word in enumerate(WORDS)}
 
 
 def word_of(status: ReleaseStatus) -> str:
@@ -356,18 +345,3 @@ class Source:
     def unwatched(self) -> list[str]:
         used = {target.domain.cluster for _, target in self.targets}
         return sorted(used - self.watched)
-
-
-@dataclass(frozen=True, slots=True)
-class HealthChange:
-    time: datetime
-    release: str
-    before: str  # a word of `WORDS`, as `after` is
-    after: str
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Commit:
-    entry: LogEntry
-    roots: tuple[str, ...]  # the top-level files and folders that it changed

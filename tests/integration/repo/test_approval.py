@@ -15,10 +15,9 @@ from demandops.serve import agenda, approvals
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
-from tests.kit.generator import Proposed
 from tests.kit.limits import files_end_at
 from tests.kit.repo import Person, branches
-from tests.kit.rig import git, goal
+from tests.kit.rig import Proposed, git, goal
 
 TITLE = "Join edge/fusion-1, vehicle01/edge, derived/station00/edge/stations/station00/pointcloud"
 

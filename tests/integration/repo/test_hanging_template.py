@@ -12,11 +12,10 @@ from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.config import skeleton
-from tests.kit.generator import receipt
 from tests.kit.goals import CLOUD, Goal, application, put
 from tests.kit.goals import goal as request
 from tests.kit.repo import GitRepo
-from tests.kit.rig import Person, goal, leave
+from tests.kit.rig import Person, goal, leave, receipt
 
 SHARED = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 TEMPLATE = "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"

@@ -18,9 +18,9 @@ from demandops.repo.write.proposal_branch import branch_name
 
 from tests.kit import rig
 from tests.kit.cli import Run
-from tests.kit.generator import Proposed
 from tests.kit.goals import Goal, application, goal, put
 from tests.kit.repo import Person, branches, read
+from tests.kit.rig import Proposed
 
 LONG = "edge/fusion-of-the-long-corridor-in-the-north-"
 PAIR = f"{LONG}4123757", f"{LONG}28067786"

@@ -16,9 +16,8 @@ from demandops.serve import approvals
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock
-from tests.kit.generator import Proposed
 from tests.kit.git_over_http import Server
-from tests.kit.rig import NOW, Person, Stages, goal
+from tests.kit.rig import NOW, Person, Proposed, Stages, goal
 
 # ---- one commit is refused ----
 

@@ -27,8 +27,8 @@ from demandops.serve.generator import Generator
 from tests.kit import config, git_over_http, goals, plain_yaml, rig
 from tests.kit.cli import Run
 from tests.kit.clock import Clock
-from tests.kit.generator import Proposed
 from tests.kit.repo import FORGER, GitRepo, Person, branches, read, state_of
+from tests.kit.rig import Proposed
 
 Steps = list[dict[str, Any]]
 

@@ -13,11 +13,10 @@ from demandops.templating.evaluator import processor_time
 
 from tests.integration.repo.test_hanging_template import ENDLESS, TEMPLATE
 from tests.kit import rig
-from tests.kit.clock import Clock
+from tests.kit.clock import Clock, Turns
 from tests.kit.goals import link
 from tests.kit.repo import read as file_of
 from tests.kit.rig import Person
-from tests.kit.turns import Turns
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 NODES, DOMAINS = "inventory/nodes.yaml", "policy/access-domains.yaml"

@@ -24,12 +24,12 @@ from demandops.web.server import Site
 from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import DENY, VIEWS, Look, causes
+from tests.integration.web.html import Page
 from tests.kit import goals
 from tests.kit.config import override
-from tests.kit.generator import Proposed, book, running, wait_until
-from tests.kit.html import Page
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, Person, away, git
+from tests.kit.rig import Proposed, book, running, wait_until
 
 LINK = {"id": "vehicle02/cloud", "type": "mqtt", "source": "vehicle02", "target": "cloud"}
 LINK |= {"topics": [{"source": "/t"}]}
@@ -68,6 +68,18 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     assert "vehicle01/edge" not in look("/connections").text
     for path in VIEWS:
         look(path)
+
+
+def test_an_application_that_others_demand_too_runs_on_without_a_suspended_requester(
+    booked: Generator, person: Person, follower: Follower, look: Look
+) -> None:
+    person.override(workshop=override({"requesters": ["vehicle00"]}, deny=True))
+    overridden(booked)
+    assert look("/").texts("h1") == ["1 thing needs attention"]
+    (cause,) = causes(follower.newest)
+    assert (cause.kind, cause.applications) == ("suspended", ())
+    page = look("/thing", kind="requester", name="vehicle00")
+    assert "kind=override&name=workshop" in page.link("workshop")
 
 
 def test_an_override_that_no_generator_carried_out_yet_is_told(bare: Path, state: GitRepo) -> None:
@@ -231,8 +243,7 @@ def test_the_overview_has_the_fleet_in_figures(
         "3 requesters 3 unknown",
         "4 of 7 nodes used",
         "0 waiting",
-        "2 changes in the last hour 2 booked, 0 released in the last hour "
-        "2 booked, 0 released in the last day",
+        "2 changes in the last hour 2 booked, 0 released in the last day",
     ]
     book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
     person.override(roadworks=DENY)

@@ -12,7 +12,7 @@ from demandops.web.server import Site, WebServer
 from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import VIEWS, Shown
-from tests.kit.html import Page
+from tests.integration.web.html import Page
 
 
 @pytest.fixture

@@ -18,8 +18,8 @@ from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 
 from tests.integration.web.conftest import Shown
-from tests.kit.generator import wait_until
 from tests.kit.limits import PATIENCE_S
+from tests.kit.rig import wait_until
 
 
 @pytest.fixture

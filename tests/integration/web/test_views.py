@@ -298,7 +298,7 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
 
 def test_the_time_line_fills_the_drawing(shown: Shown) -> None:
     follower = shown.follower
-    events = time_line.events(follower.history, follower.health_changes)
+    events = follower.history
     strip = time_line.strip(events, events[0].time, "all", None)
     template = (Path(time_line.__file__).parent / "pages" / "timeline.html.j2").read_text()
     width = int(re.findall(r'x2="(\d+)"', template)[0])

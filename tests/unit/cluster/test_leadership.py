@@ -21,8 +21,8 @@ from demandops.cluster.leadership import Leadership
 from kubernetes import client, config
 
 from tests.kit.chance import IN_FULL
+from tests.kit.clock import Turns
 from tests.kit.http import Answer, Call, kubeconfig, serving
-from tests.kit.turns import Turns
 
 PATH = "/apis/coordination.k8s.io/v1/namespaces/its/leases/generator"
 TAKES_OVER_S = 15 + 2

@@ -22,13 +22,12 @@ from demandops.decide.decision import decide
 
 from tests.kit import goals
 from tests.kit.clock import Clock
-from tests.kit.cluster import Letters
-from tests.kit.generator import wait_until
+from tests.kit.cluster import Letters, kube_api
 from tests.kit.golden import requests_of, start
 from tests.kit.http import Answer, Call, kubeconfig, serving
-from tests.kit.kube_api import kube_api
 from tests.kit.limits import PATIENCE_S
 from tests.kit.memory import NOW, MemoryRepo
+from tests.kit.rig import wait_until
 
 OVER = ObjectSelector("Application", "argocd", "demandops-perception")
 CHILDREN = ObjectSelector("Application", "perception")

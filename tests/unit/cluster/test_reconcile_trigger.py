@@ -20,11 +20,11 @@ from demandops.cluster.reconcile_trigger import ReconcileTrigger, _Wake, signatu
 
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
-from tests.kit.generator import wait_until
+from tests.kit.cluster import KubeApi, kube_api
 from tests.kit.golden import start
 from tests.kit.http import Answer, Call, Server, kubeconfig, serving
-from tests.kit.kube_api import KubeApi, kube_api
 from tests.kit.limits import PATIENCE_S
+from tests.kit.rig import wait_until
 
 TABLES = plain_yaml.load(Path(__file__).with_name("clusters.yaml").read_text())
 SOURCED = {"sourceRef": {"name": "demandops"}}

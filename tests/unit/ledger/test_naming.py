@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import combinations
 from types import MappingProxyType
 
 from demandops.base import naming
@@ -13,6 +14,7 @@ from demandops.base.errors import Refused
 from demandops.base.naming import id_problem
 from demandops.decide.decision import Decision
 from demandops.model.config.inventory import Node
+from demandops.model.ledger.claim import demand_id
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -105,6 +107,11 @@ def test_different_subjects_have_different_names_that_kubernetes_takes(
     ros_names = {naming.ros_name(name) for name in names}
     assert len(ros_names) == len(names)
     assert all(ROS_NODE.fullmatch(name) for name in ros_names)
+
+
+def test_each_group_of_requesters_has_a_demand_of_its_own() -> None:
+    pairs = [*combinations(["a", "a,b", "b", "a b", '["a"]', "a\\", "\\a", '"'], 2)]
+    assert len({demand_id("request", pair) for pair in pairs}) == len(pairs)
 
 
 def as_the_reference(id: str) -> str:

@@ -22,9 +22,9 @@ from demandops.repo.forge import Forge, ForgeError, Gitea, PullRequest, forge_fo
 from demandops.serve.proposal import ForgeWorker
 
 from tests.kit import plain_yaml
+from tests.kit.clock import Turns
 from tests.kit.config import configuration
 from tests.kit.http import Answer, Call, Server, serving
-from tests.kit.turns import Turns
 
 TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
 _EXCHANGES = Path(__file__).with_name("exchanges")

@@ -24,9 +24,9 @@ from demandops.serve.journal import (
     read,
 )
 
-from tests.kit.generator import journaled
 from tests.kit.goals import perception
 from tests.kit.limits import files_end_at
+from tests.kit.rig import journaled
 
 PROPOSAL = ProposalRecord("demand/x", ("a",))
 

@@ -21,10 +21,9 @@ from demandops.cli.formats import Command, output_option, show
 from demandops.cli.output import busy
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.decide.state import State, try_configuration
-from demandops.model.config.base_model import document
+from demandops.model.config.base_model import document, matches
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
 from demandops.model.config.load import load
-from demandops.model.config.policy import matches
 from demandops.model.config.registry import Image
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo import new_repo

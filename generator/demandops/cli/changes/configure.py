@@ -28,11 +28,10 @@ from demandops.cli.target import all_names, names_of
 from demandops.decide.booking import Drain
 from demandops.decide.placement import relocation
 from demandops.decide.state import State
-from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
+from demandops.model.config.base_model import document, matches, parse_file, parse_time, seconds_of
 from demandops.model.config.config import NODES_FILE
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
-from demandops.model.config.policy import matches
 from demandops.model.ledger.claim import LEDGER_ROOT
 from demandops.views.vocabulary import Json, override_data
 

@@ -23,7 +23,7 @@ from demandops.cli.queries.commits import loaded
 from demandops.cli.queries.status import ask_clusters
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.cluster import clusters_file
-from demandops.model.config.policy import matches
+from demandops.model.config.base_model import matches
 from demandops.model.config.repo_settings import Proposals
 from demandops.repo import reader
 from demandops.repo.forge import ForgeError, forge_for

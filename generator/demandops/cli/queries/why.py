@@ -108,7 +108,7 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
             until += f" until {time_text(lease['until'])}" if lease["until"] else ", not started"
         until += (
             ", which has passed; a generator has yet to release the claim"
-            if claim["overdue"]
+            if claim["state"] == "overdue"
             else ""
         )
         version = f", version {claim['version']}" if claim["version"] else ""

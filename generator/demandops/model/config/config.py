@@ -15,7 +15,6 @@ from demandops.base.errors import Fault, InvalidInput, Refused, fault, field_pat
 from demandops.model.config import registry
 from demandops.model.config.appdef import (
     ApplicationDefinition,
-    Service,
     ServiceDefinition,
     Services,
 )
@@ -121,7 +120,7 @@ class Config:
         for _, node in sorted(self.nodes.items()):
             for role in ("", node.type):
                 by_role.setdefault(role, []).append(node)
-            for trait in {*((name,) for name in node.capabilities), *node.labels().items()}:
+            for trait in {*((name,) for name in node.capabilities), *node.labels.items()}:
                 by_trait.setdefault(trait, []).append(node)
         services = [s for services in self.services.values() for s in services.values()]
         indexes = {
@@ -183,9 +182,6 @@ class Config:
             file = NODES_FILE if node is None else DOMAINS_FILE
             raise Refused.at("node", message, code="unknown-node", file=file)
         return node, domain
-
-    def values_template(self, service: Service) -> str:
-        return f"appdefs/{service.folder}/{service.values}"
 
 
 # ---- the reader: item by item, to find the faults of every item ----

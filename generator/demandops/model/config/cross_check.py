@@ -7,10 +7,10 @@ from demandops.base.errors import InvalidInput, suggestion
 from demandops.connections import connection_types
 from demandops.model.config import config as configs
 from demandops.model.config.appdef import Deployed, ServiceDefinition
+from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config, ConfigReader
 from demandops.model.config.inventory import comparable_kind, kind_of
 from demandops.model.config.override import patched_settings
-from demandops.model.config.policy import matches
 from demandops.model.config.registry import ChartSource
 from demandops.templating import charts
 

@@ -24,11 +24,12 @@ from demandops.model.config.appdef import (
     Services,
     resolved_services,
 )
+from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config, ConfigReader
 from demandops.model.config.cross_check import cross_check
 from demandops.model.config.inventory import Node, id_in_domain
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
-from demandops.model.config.policy import AccessDomain, AccessDomainsFile, matches
+from demandops.model.config.policy import AccessDomain, AccessDomainsFile
 from demandops.model.config.repo_settings import ROOT_FILE, Flux, RepoSettings
 
 Definition = TypeVar("Definition", ApplicationDefinition, ServiceDefinition)
@@ -204,7 +205,8 @@ def _services_of(
         if service.requests:
             place = "requests" if service.shared else f"services.{name}.requests"
             named = _with_short_names(service.requests, settings, reader, service.file, place)
-            services[name] = service.model_copy(update={"requests": named})
+            of_pods = {"requests": named, "pod_requests": settings.requests_of_pods(named)}
+            services[name] = service.model_copy(update=of_pods)
         if service.nodes:
             runs_at = {}
             for node in nodes:

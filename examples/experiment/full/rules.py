@@ -16,7 +16,7 @@ import yaml
 
 from .routes import Way
 
-RULES = Path(__file__).resolve().parents[2] / "examples" / "experiment" / "rules.yaml"
+RULES = Path(__file__).resolve().parents[1] / "rules.yaml"
 
 
 @dataclass(frozen=True)

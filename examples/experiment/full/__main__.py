@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from tests.kit.bag import write_bag
 from tests.kit.browser import chromium
+from tests.kit.detection import write_bag
 
 from . import crowd, report, routes
 from .bags import bag_tracks

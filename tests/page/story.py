@@ -16,12 +16,12 @@ from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 
 from tests.kit import goals
+from tests.kit.cluster import KubeApi, kube_api
 from tests.kit.config import override
-from tests.kit.generator import book, wait_until
 from tests.kit.goals import Goal
 from tests.kit.http import kubeconfig
-from tests.kit.kube_api import KubeApi, kube_api
 from tests.kit.repo import Person
+from tests.kit.rig import book, wait_until
 
 NAMESPACE = "perception"
 FAILING = "od-edge-vehicle00"

@@ -34,7 +34,7 @@ from .process_runner import ProcessRunner
 from .rules import Event, Near, Pose, causes, events_of, poses_in, predicted
 from .standins import image
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 _STAND_S = 0.5
 """How many seconds before an event's cause the vehicles stop, to wait for the event before it."""
 _INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
@@ -113,7 +113,9 @@ class Experiment:
         seed, origin = self._settings.seed, self._near.point
         plan = Plan(self._routes, origin, self._domains, seed, record, station_cloud, poses_only)
         plan.write(file)
-        self._participants = self._start("participants", "tests.experiment.participants", str(file))
+        self._participants = self._start(
+            "participants", "examples.experiment.full.participants", str(file)
+        )
         assert self._read()["ready"]
 
     def _detect(self, rules: str) -> None:

@@ -12,8 +12,8 @@ import paho.mqtt.client as mqtt
 
 from tests.e2e.rig import launch
 from tests.e2e.rig.net import accepts, free_port
-from tests.kit.generator import wait_until
 from tests.kit.limits import PATIENCE_S
+from tests.kit.rig import wait_until
 
 
 class Broker:

@@ -8,7 +8,7 @@ from geometry_msgs.msg import Pose, PoseArray
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
-from tests.experiment.clouds import Point, from_message
+from examples.experiment.full.clouds import Point, from_message
 
 from .running import spin, start
 

@@ -1,6 +1,6 @@
 """The vehicles and the station as one ROS program; each is in the ROS domain of its node.
 
-Call: `python -m tests.experiment.participants PLAN`.
+Call: `python -m examples.experiment.full.participants PLAN`.
 
 PLAN is a JSON file with the fields of `Plan`. The vehicles publish from the program's start to its
 end, also while they stand. Each line on standard input is a time, in seconds of driving. At the
