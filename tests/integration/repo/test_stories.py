@@ -17,8 +17,11 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.base.naming import Subject, SubjectKind
 from demandops.decide.state import rendered_files
 from demandops.model.demand import goals as demand_goals
+from demandops.model.ledger.claim import ClaimKey, path_of
+from demandops.model.ledger.records import waiting_path
 from demandops.repo import reader
 from demandops.repo.merge_check import merge_check
 from demandops.serve import agenda
@@ -319,10 +322,13 @@ class Story:
         self.change({path: text + self._person.read(path) for path, text in texts.items()})
 
     def forge(self, commit: Mapping[str, Any]) -> None:
-        """Commit a text of a file in the generator's name, with trailers."""
-        files = {path: [old, new] for path, (old, new) in commit.get("files", {}).items()}
+        """Commit in the generator's name, with trailers: texts of files, or a broken claim."""
         lines = "".join(f"{key}: {value}\n" for key, value in commit["trailers"].items())
-        self.change(files, message=f"Forged\n\nWhy: x\n\n{lines}Render-Version: 3", who=FORGER)
+        how = {"message": f"x\n\nWhy: x\n\n{lines}Render-Version: 3", "who": FORGER}
+        if word := commit.get("claim"):
+            self.edit_claim({word: "kind: 5\n"}, **how)
+        else:
+            self.change(commit["files"], **how)
 
     def undo(self, last: str) -> None:
         """Undo the last change."""
@@ -334,11 +340,29 @@ class Story:
         files = {f"overrides/{n}.yaml": fields and head | fields for n, fields in overrides.items()}
         self.change(files)
 
-    def edit_claim(self, texts: Mapping[str, Any]) -> None:
+    def edit_claim(self, texts: Mapping[str, Any], **commit: Any) -> None:
         """Change the application's claim file that holds a word."""
         for word, text in texts.items():
             (path,) = [p for p in rig.claims(self._bare, word) if "applications" in p]
-            self.change({path: text})
+            self.change({path: text}, **commit)
+
+    def edit_waiting(self, texts: Mapping[str, Any]) -> None:
+        """Change the files of demands that wait for room."""
+        self.change({waiting_path(name): text for name, text in texts.items()})
+
+    def claim_by_hand(self, claims: Mapping[str, Mapping[str, Any]]) -> None:
+        """Copy the application's claim that holds a word, with changes, of which `check` tells."""
+        for word, new in claims.items():
+            (path,) = [p for p in rig.claims(self._bare, word) if "applications" in p]
+            data = plain_yaml.load(read(self._bare, path))
+            data |= {name: new[name] for name in ("demand", "requesters") if name in new}
+            data["application"] |= {name: new[name] for name in ("id", "node") if name in new}
+            subject = Subject(SubjectKind.APPLICATION, data["application"]["id"])
+            files = {path_of(ClaimKey(subject, data["demand"])): yaml.safe_dump(data)}
+            self._person.write(files)
+            told = [f"{one.code} {one}" for one in merge_check.check(self._person.folder).faults]
+            assert new["told"] in told[0] if "told" in new else told == [], told
+            self._person.change(files)
 
     def delete_claims(self, word: str) -> None:
         self.change(dict.fromkeys(rig.claims(self._bare, word)))
@@ -535,7 +559,7 @@ class Story:
             commits = repo.revisions(f"{rig.root(self._bare)}..")
             found = repo.verify(commits)
             assert found == repo.verify(commits, whole=True)
-        assert [verdict.holds for verdict in found][::-1] == holds, found
+        assert [verdict.holds for verdict in found] == holds, found
 
     def fails(self, what: str) -> None:
         assert any(name.startswith(what) for name in self._generator.failures)
