@@ -129,8 +129,8 @@ e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONF
 
 # With FIGURES=1 the target also draws the plots of the docs: docs/figures
 experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
-experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (tests/experiment/README.md)
-	@$(PY) -m tests.experiment $(EXPERIMENT)
+experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (examples/experiment/full/README.md)
+	@$(PY) -m examples.experiment.full $(EXPERIMENT)
 
 check: system-test setup  ## Format, lint, types, imports, docs, test, test-processes and test-packages
 	@$(PY) -m ruff format --check .

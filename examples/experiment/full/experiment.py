@@ -15,26 +15,29 @@ from pathlib import Path
 from typing import Any
 
 from examples.experiment import paper
-from tests.e2e.common.answers import limited_world
-from tests.e2e.common.expected import CLUSTER
-from tests.e2e.common.ros import Client
-from tests.e2e.common.world import World, demandops, environment
-from tests.e2e.rig import launch
-from tests.e2e.rig.cluster import Rig
-from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import git
-from tests.kit.ros import reserved
 
 from . import fleet, routes
-from .broker import Broker
-from .observers import CloudObserver, EdgeObserver
+from .observers import Broker, CloudObserver, EdgeObserver
 from .outcome import Formed, Outcome, Settings
 from .participants import POSE, Plan
 from .process_runner import ProcessRunner
+from .rig import (
+    CLUSTER,
+    PATIENCE_S,
+    Client,
+    Rig,
+    World,
+    demandops,
+    environment,
+    git,
+    launch,
+    limited_world,
+    reserved,
+)
 from .rules import Event, Near, Pose, causes, events_of, poses_in, predicted
 from .standins import image
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 _STAND_S = 0.5
 """How many seconds before an event's cause the vehicles stop, to wait for the event before it."""
 _INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
@@ -113,7 +116,9 @@ class Experiment:
         seed, origin = self._settings.seed, self._near.point
         plan = Plan(self._routes, origin, self._domains, seed, record, station_cloud, poses_only)
         plan.write(file)
-        self._participants = self._start("participants", "tests.experiment.participants", str(file))
+        self._participants = self._start(
+            "participants", "examples.experiment.full.participants", str(file)
+        )
         assert self._read()["ready"]
 
     def _detect(self, rules: str) -> None:
