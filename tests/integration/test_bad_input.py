@@ -75,7 +75,7 @@ def test_of_a_chart_that_people_broke_the_last_valid_version_stays_in_force(
 def test_a_mistake_anywhere_in_a_goal_changes_nothing(
     on: On, state: GitRepo, data_home: Path, valid: Any, model: Any
 ) -> None:
-    """A sample only; ``tests/unit/demand/test_mistakes_in_goals.py`` tries every mistake."""
+    """A sample only; ``tests/unit/model/test_mistakes_anywhere.py`` tries every mistake."""
     form, before = Form(model.model_json_schema()), state.tip
     wrong = [m for m in mutations(valid()) if form.forbids(m.document)]
     for mutation in wrong[:: len(wrong) // 4]:
