@@ -493,8 +493,8 @@ def read(text: str, file: str) -> RuleFile:
 def _faults(rules: RuleFile) -> Iterator[Fault]:
     names: set[str] = set()
     ids: list[tuple[str, Rule]] = []
-    for name, source in rules.sources.items():
-        if rules.map is None and source.position and source.position.in_degrees:
+    for name, listed in rules.sources.items():
+        if rules.map is None and listed.position and listed.position.in_degrees:
             message = (
                 "reports degrees; add to the file where its metres are on earth, such as "
                 "'map: {latitude: 50.7784, longitude: 6.0606}'"
