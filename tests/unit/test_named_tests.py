@@ -17,6 +17,7 @@ import pytest
 from tests.integration import test_stories
 from tests.integration.repo.test_stories import STORIES
 from tests.scenarios import running
+from tests.simulation.faults import FAULTS
 
 ROOT = Path(__file__).parents[2]
 NAMED = re.compile(r"`(tests/[\w/]+\.py)::([\w:]+)(?:\[([^\]`]+)\])?`")
@@ -44,6 +45,7 @@ def test_a_test_that_a_page_names_exists(page: str) -> None:
         *running.scenarios(),
         *STORIES,
         *test_stories.STORIES,
+        *FAULTS,
     }
 
 
