@@ -26,6 +26,14 @@ def test_only_the_flag_changes(text: str, id: str, wanted: str) -> None:
     assert strict_yaml.set_flag(text, "nodes", id, "drained", True) == wanted
 
 
+def test_a_flag_that_has_its_own_line_is_taken_away() -> None:
+    drained = strict_yaml.set_flag(BLOCK, "nodes", "a", "drained", True)
+    assert strict_yaml.set_flag(drained, "nodes", "a", "drained", False) == BLOCK
+    first = "nodes:\n- drained: true\n  id: a\n"
+    changed = strict_yaml.set_flag(first, "nodes", "a", "drained", False)
+    assert changed == first.replace("true", "false")
+
+
 def test_what_two_items_share_is_left_to_a_person() -> None:
     text = "nodes:\n- &a {id: a}\n- <<: *a\n  id: b\n"
     with pytest.raises(InvalidInput):

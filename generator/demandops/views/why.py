@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from demandops.base.errors import (
     DemandOpsError,
@@ -60,6 +60,8 @@ _TOLD_APART = KINDS[:3]
 _MOST_LISTED = 8
 # The trailer that names the thing in the commits that are about it.
 _TRAILERS = {"demand": "Demand-Id", "requester": "Requester"}
+# What an override selects by name.
+_SELECTED = ("requester", "application", "connection", "service", "appdef", "node")
 
 
 @dataclass(frozen=True, slots=True)
@@ -452,6 +454,13 @@ def _past(source: Source, reader: Reader, thing: Thing, most: int) -> Json:
         history = PathHistory(started, tuple(about[:most]), more, stopped)
     elif thing.path:
         history = reader.history(thing.path, source.commit, most)
+    if thing.kind in _SELECTED:
+        log, listed = reader.log(source.commit), {entry.commit for entry in history.newest}
+        edits = (entry for entry in log if reader.edits(entry, thing.kind, thing.name))
+        newest = [*history.newest, *(entry for entry in edits if entry.commit not in listed)]
+        newest.sort(key=lambda entry: entry.time, reverse=True)
+        more = history.more + max(len(newest) - most, 0)
+        history = replace(history, newest=tuple(newest[:most]), more=more)
 
     def row(entry: LogEntry | None) -> Json | None:
         if entry is None:

@@ -282,16 +282,22 @@ def log(
                     "`demandops status` lists the current ones"
                 )
         commits = repo.log(commit_range, path) if path else repo.log(commit_range)
-        wanted = [(_TRAILERS[name], given[name]) for name in _TRAILERS if given[name] is not None]
+        wanted = [(name, given[name]) for name in (*_TRAILERS, "node") if given[name] is not None]
+
+        def is_about(entry: LogEntry, kind: str, name: str) -> bool:
+            named = entry.trailers.get(_TRAILERS.get(kind, ""), ())
+            # the trees of a commit are read last
+            return name in named or (
+                (kind == "node" and repo.changes_node(entry.commit, name))
+                or (kind != "demand" and repo.edits(entry, kind, name))
+            )
 
         def matches(entry: LogEntry) -> bool:
             return (
-                all(value in entry.trailers.get(trailer, ()) for trailer, value in wanted)
-                and given["operation"] in (None, entry.first("Operation") or "by-hand")
+                given["operation"] in (None, entry.first("Operation") or "by-hand")
                 and (given["since"] is None or entry.time >= given["since"])
                 and (given["until"] is None or entry.time <= given["until"])
-                # last, because it reads the trees of the commit
-                and (given["node"] is None or repo.changes_node(entry.commit, given["node"]))
+                and all(is_about(entry, *each) for each in wanted)
             )
 
         with busy("looking through the commits"):

@@ -147,7 +147,7 @@ def _override_text(override: Json) -> str:
 def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
     when, word = time_text(entry["time"]), entry["operation"] or "by hand"
     yield f"  {entry['commit'][:10]} {when}  {word}, {entry['author']}: {entry['summary']}"
-    if why and entry["why"]:
+    if entry["why"] and (why or not entry["operation"]):  # a person's reason is nowhere else
         yield f"    {entry['why']}"
     if entry["decision"]:
         yield f"    {decision_text(entry['decision'])}"

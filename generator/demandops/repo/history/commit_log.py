@@ -112,7 +112,7 @@ def entry_of(commit: Commit) -> LogEntry:
         author=_name_and_email(commit.author)[0],
         summary=text.summary,
         trailers=text.trailers if is_told else {},
-        why=text.why if is_told else "",
+        why=text.why if is_told else one_line(text.body),
         by_generator=is_ours and not is_proposal and "Render-Version" in text.trailers,
         authored=_time(commit.author.time),
     )
