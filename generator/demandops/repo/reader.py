@@ -215,8 +215,8 @@ class Reader:
     def release_path(self, name: str, revision: str) -> str | None:
         return commit_log.release_path(self._objects, revision, name)
 
-    def stopped_release_names(self, revision: str) -> set[str]:
-        return commit_log.stopped_release_names(self._objects, revision)
+    def stopped_releases(self, revision: str) -> dict[str, list[str]]:
+        return commit_log.stopped_releases(self._objects, revision)
 
     def changed_files(self, before: str, after: str, roots: Sequence[str] = ()) -> list[str]:
         changed = trees.differences(self._tree(before), self._tree(after), roots)

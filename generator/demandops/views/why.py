@@ -97,12 +97,15 @@ def find(source: Source, name: str, kind: str | None = None) -> Thing:
     # a part of a release's name, or the start of a demand's id; what runs before what has ended
     running = sorted(release for release in source.releases if name in release)
     demands = sorted(id for id in _demands(source) if id.startswith(name))
-    ended = sorted(reader.stopped_release_names(source.commit))
+    stopped = reader.stopped_releases(source.commit).values()
+    ended = sorted({release for names in stopped for release in names})
     were = [release for release in ended if name in release]
+    past = {id for entry in reader.log(source.commit) for id in entry.trailers.get("Demand-Id", ())}
     for each, names, what in (
         ("release", running, "releases have {} in their name"),
         ("demand", demands, "demand ids begin with {}"),
         ("release", were, "releases have {} in their name"),
+        ("demand", sorted(id for id in past if id.startswith(name)), "demand ids begin with {}"),
     ):
         if kind in (None, each) and names:
             if len(names) > 1:
