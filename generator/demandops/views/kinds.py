@@ -23,6 +23,7 @@ from demandops.decide.bookkeeping import (
 from demandops.decide.planning.overrides import suspended_by
 from demandops.model.config.base_model import duration_text, parse_time, relative
 from demandops.model.config.config import DOMAINS_FILE
+from demandops.model.config.entry_patterns import is_pattern
 from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand
@@ -528,13 +529,17 @@ def _nodes(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
         for id in nodes_of(claim):
             needing[id].append(claim)
     # A claim may need a node that a person removed from the inventory.
-    for id in sorted({*source.config.nodes, *needing}):
+    for id in sorted({*(node.id for node in source.config.kinds_of_nodes()), *needing}):
         yield id, (id, needing[id], _runs(source, sorted(running[id])))
 
 
 def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
     node, domain = source.config.nodes.get(id), source.config.domain_of.get(id)
     state = "open" if node else "not in the inventory"
+    if is_pattern(id):  # it stands for all nodes that it matches
+        (node,) = (each for each in source.config.kinds_of_nodes() if each.id == id)
+        state, possible = "pattern", source.config.domains_at(node)
+        domain = possible[0] if len(possible) == 1 else None
     return {
         "name": id,
         "state": "drained" if node and node.drained else state,
@@ -560,10 +565,12 @@ def _properties(item: Json, now: datetime) -> list[str]:
 
 def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     nodes: defaultdict[str, list[str]] = defaultdict(list)
-    for id, domain in sorted(source.config.domain_of.items()):
-        nodes[domain.name].append(id)
+    clusters: defaultdict[str, set[str]] = defaultdict(set)
+    for node in sorted(source.config.kinds_of_nodes(), key=lambda node: node.id):
+        for domain in source.config.domains_at(node):
+            nodes[domain.name].append(node.id)
+            clusters[domain.name].add(node.cluster)
     for name, domain in sorted(source.config.domains.items()):
-        clusters = {source.config.nodes[id].cluster for id in nodes[name]}
         item = {
             "name": name,
             "namespace": domain.namespace,
@@ -571,7 +578,7 @@ def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
             "when_full": domain.when_full,
             "network": domain.network,
             "rules": len(domain.rules),
-            "clusters": sorted(clusters),
+            "clusters": sorted(clusters[name]),
             "nodes": nodes[name],
             "file": source.config.file_of(DOMAINS_FILE, name),
         }

@@ -9,8 +9,7 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any, Literal, TypeVar
 
-from demandops.model.config.base_model import parse_time, relative
-from demandops.model.config.policy import matches
+from demandops.model.config.base_model import matches, parse_time, relative
 from demandops.views.vocabulary import Json
 
 # The tone of each word for a state, which is its color on a terminal and on the page. The worst

@@ -286,7 +286,8 @@ def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]
     # (file, entry, what it decides) for all that shapes a release but overrides
     images = {name: config.images[name] for name in release.images if name in config.images}
     if isinstance(release, ServiceRelease):
-        images = {name: release.version.image(name, image) for name, image in images.items()}
+        pins = release.version.images
+        images |= {name: pins[name].over(images[name]) for name in images if name in pins}
     node, domain, file_of = release.node, release.domain, config.file_of
     return [
         (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),

@@ -86,7 +86,7 @@ def requirement(random: Random) -> dict[str, Any]:
 
 
 def has(node: Node, place: dict[str, Any]) -> bool:
-    labels = {f"{key}={value}" for key, value in node.labels().items()}
+    labels = {f"{key}={value}" for key, value in node.labels.items()}
     return (
         node.type == place["role"]
         and {*place["labels"]} <= labels

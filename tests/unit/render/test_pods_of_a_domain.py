@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 import yaml
 from demandops.decide.state import rendered_files
+from demandops.model.config.base_model import matches
 from demandops.model.config.load import load
-from demandops.model.config.policy import matches
 from demandops.render.gitops import expression_of, node_rule
 from demandops.repo.merge_check.rendered_charts import manifest_faults
 
@@ -59,9 +59,9 @@ def test_a_pod_selects_a_node_of_its_domain() -> None:
     for domain in config.domains.values():
         rule = node_rule("c-its", domain, config)
         for node in config.nodes.values():
-            own = config.domain_of[node.id] is domain or node.labels() == {"node_id": "own3"}
-            assert taken(rule, node.labels()) == own, (domain.name, node.id)
-            assert taken(rule, node.labels() | {"more": "narrower"}) == own
+            own = config.domain_of[node.id] is domain or node.labels == {"node_id": "own3"}
+            assert taken(rule, node.labels) == own, (domain.name, node.id)
+            assert taken(rule, node.labels | {"more": "narrower"}) == own
         for selector in ({}, {"node_id": "other"}, {"place": "x"}, {"kubernetes.io/os": "linux"}):
             assert not taken(rule, selector), selector
 

@@ -24,8 +24,7 @@ from demandops.cli.queries.commits import loaded, time_of
 from demandops.cli.queries.status import ask_clusters
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.cluster import clusters_file
-from demandops.model.config.base_model import parse_time
-from demandops.model.config.policy import matches
+from demandops.model.config.base_model import matches, parse_time
 from demandops.model.config.repo_settings import Proposals
 from demandops.repo import reader
 from demandops.repo.forge import ForgeError, forge_for
@@ -249,7 +248,7 @@ def _refuse_unknown(
     # a filter may match no item if it names something that exists, such as a node without demands
     ledger, config = source.state.ledger, source.config
     existing: dict[str, Iterable[str]] = {
-        "node": {*config.nodes, *ledger.indexed_names("node")},
+        "node": {*(node.id for node in config.kinds_of_nodes()), *ledger.indexed_names("node")},
         "domain": config.domains,
         "requester": ledger.indexed_names("requester"),
         "application": ledger.subjects(SubjectKind.APPLICATION),

@@ -25,11 +25,11 @@ from demandops.model.config.base_model import (
     Items,
     Pattern,
     Visible,
+    matches,
     parse_time,
     time_text,
 )
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
-from demandops.model.config.policy import matches
 from demandops.model.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
 from demandops.templating.charts import overridden
 
