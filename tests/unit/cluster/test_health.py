@@ -17,7 +17,7 @@ from demandops.cluster.health import (
     worst,
 )
 
-from tests.kit.cluster import Case, Letters, condition, deployments, read_cases, told
+from tests.unit.cluster.cases import Case, Letters, condition, deployments, read_cases, told
 
 COMMITS = Letters()
 ARGOCD_CASES, FLUX_CASES = (read_cases(__file__, f"{name}.yaml") for name in ("argocd", "flux"))
