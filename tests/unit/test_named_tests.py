@@ -89,9 +89,3 @@ def files_run_by(target: str) -> frozenset[Path]:
 def test_every_test_file_is_run() -> None:
     run = frozenset[Path]().union(*map(files_run_by, TARGETS))
     assert [str(file.relative_to(ROOT)) for file in TEST_FILES if file not in run] == []
-
-
-@pytest.mark.parametrize("target", TARGETS)
-def test_a_target_runs_tests_of_its_own(target: str) -> None:
-    others = (files_run_by(other) for other in TARGETS if other != target)
-    assert files_run_by(target) - frozenset[Path]().union(*others)
