@@ -15,6 +15,15 @@ TABLES = plain_yaml.beside(__file__)
 @pytest.mark.parametrize(("text", "id", "wanted"), TABLES["flags"])
 def test_only_the_flag_of_one_item_changes(text: str, id: str, wanted: str) -> None:
     assert strict_yaml.set_flag(text, "nodes", id, "drained", True) == wanted
+    if wanted.count("\n") > text.count("\n"):
+        # a line of its own is taken away again
+        assert strict_yaml.set_flag(wanted, "nodes", id, "drained", False).rstrip() == text.rstrip()
+
+
+def test_a_flag_that_begins_an_item_is_set_to_false() -> None:
+    text = "nodes:\n- drained: true\n  id: a\n"
+    changed = strict_yaml.set_flag(text, "nodes", "a", "drained", False)
+    assert changed == text.replace("true", "false")
 
 
 def test_what_two_items_share_is_left_to_a_person() -> None:
