@@ -47,7 +47,7 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
     # out, even if they share a subject with this one
     after, request = decision.state, decision.request
     active = without_suspended(after)
-    claims = [*active.ledger.claims_of_demand(request.demand)]
+    claims = [*active.ledger.claims_with("demand", request.demand)]
     for demanded in request.demanded if request.adds_claims else ():
         own = demand_id(request.id, demanded.requesters)  # that of a join
         if claim := active.ledger.get(ClaimKey(demanded.held.subject, own)):

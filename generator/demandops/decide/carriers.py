@@ -430,7 +430,7 @@ def without_idle_routes(
         and change.before
         and not change.only_renews
     ):
-        claims = ledger.claims_of_demand(demand)
+        claims = ledger.claims_with("demand", demand)
         needed = {
             (flow.key.sender, *flow.key[2:])
             for claim in claims

@@ -101,7 +101,9 @@ class Decision:
             leases = (permission.lease_in(domain, put) for domain in domains)
             return min((lease.seconds for lease in leases if lease), default=None)
         claims = (
-            self.state.ledger.claims_of_demand(self.request.demand) if self.request.demand else ()
+            self.state.ledger.claims_with("demand", self.request.demand)
+            if self.request.demand
+            else ()
         )
         claims = claims or tuple(change.after for change in self.changes.claims if change.after)
         return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
@@ -324,7 +326,7 @@ def _wait(
     if demand.operation != "put" or any(each.code != NO_ROOM for each in faults):
         return None
     # a demand that holds claims keeps them when it is refused, so it cannot wait as well
-    if state.ledger.claims_of_demand(demand.demand):
+    if state.ledger.claims_with("demand", demand.demand):
         return None
     if strangers := list(permission.owner_faults(demand, state.ledger, state.config)):
         raise Refused(strangers)

@@ -94,7 +94,7 @@ def test_a_goal_is_told_why_it_waits_and_can_be_taken_back_meanwhile(
         assert generator.withdraw("op-3") is True
         assert rig.outcome(goes) == "Withdrawn"
         assert not stays.future.done()
-        assert generator.snapshot.state.ledger.claims_of_requester("user1"), (
+        assert generator.snapshot.state.ledger.claims_with("requester", "user1"), (
             "the known state must stay readable"
         )
         server.faults.away = False

@@ -55,7 +55,7 @@ def renew(demand: str, *who: str) -> rig.Goal:
 
 
 def held(generator: Generator, demand: str) -> tuple[Claim, ...]:
-    return generator.snapshot.state.ledger.claims_of_demand(demand)
+    return generator.snapshot.state.ledger.claims_with("demand", demand)
 
 
 def wait_until_gone(generator: Generator, demand: str) -> None:

@@ -26,7 +26,6 @@ from demandops.model.config.override import Selector, format_time
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ApplicationVersion, precedence
 from demandops.model.demand.demand import Application, Demand, Item
-from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Changes, ClaimChange, World
 from demandops.model.release import Release, ServiceKey, ServiceRelease
 
@@ -101,7 +100,7 @@ def warnings(request: Demand, world: World) -> Iterator[str]:
     if not any(override.deny for override in world.overrides):
         return
     claims = [
-        *world.ledger.claims_of_demand(request.demand),
+        *world.ledger.claims_with("demand", request.demand),
         *(claim for subject in request.subjects() for claim in world.ledger.claims_on(subject)),
     ]
     for claim in {claim.key: claim for claim in claims}.values():
@@ -159,7 +158,7 @@ def quota_faults(before: World, after: World, changes: Changes) -> Iterator[Faul
 
 
 def _held(requester: str, world: World, domain: AccessDomain) -> int:
-    claims = world.ledger.claims_of_requester(requester)
+    claims = world.ledger.claims_with("requester", requester)
     return sum(world.config.domain_of.get(claim.held.home) is domain for claim in claims)
 
 
@@ -261,46 +260,44 @@ def differences(
         item, claim, old = listed.get(change.key.subject), change.after, change.before
         if item is None or claim is None or not claim.is_on_application:
             continue
-        demanded[claim.application.id] = item, claim.application.version
-        if old is None or old.application.version != claim.application.version:
-            yield from _of_application(item, claim, after)
+        app = claim.application
+        demanded[app.id] = item, app.version
+        if old is not None and old.application.version == app.version:
+            continue
+        versions = after.config.application_versions[app.appdef]
+        # Two words may name one version, for example a channel and a number.
+        if len({versions[word].rank for word in after.ledger.versions_asked(app.id, versions)}) < 2:
+            continue
+        others = after.ledger.replace(claim.key, None)
+        own = versions.get(app.version, versions[""])
+        theirs = newest_asked(others, app.id, versions)
+        if own.rank == theirs.rank:
+            continue
+        holders, held = "", ""
+        for other in others.claims_on(app.subject):
+            word = other.application.version
+            if versions.get(word, versions[""]).rank == theirs.rank:
+                holders, held = ", ".join(other.requesters), word if word in versions else ""
+                break
+        message = (
+            f"{_version_text(app.version, own)} contradicts an existing claim: '{app.id}' is held "
+            f"by {holders} in {_version_text(held, theirs)}; request that version, or use another "
+            "application id"
+        )
+        difference = Difference(
+            f"application '{app.id}'",
+            app.appdef,
+            after.config.appdefs[app.appdef].versions,
+            own.name,
+            theirs.name,
+            own.rank > theirs.rank,
+            item.fault("version", message, code="conflict"),
+        )
+        if difference.matters_to(app.version):
+            yield difference
     for release in plans.values():
         if isinstance(release, ServiceRelease) and len(release.applications) > 1:
             yield from _of_service(release, demanded, before, without_suspended(after))
-
-
-def _of_application(item: Item, claim: Claim, after: World) -> Iterator[Difference]:
-    app, ledger = claim.application, after.ledger
-    versions = after.config.application_versions[app.appdef]
-    # Two words may name one version, for example a channel and a number.
-    if len({versions[word].rank for word in ledger.versions_asked(app.id, versions)}) < 2:
-        return
-    others = ledger.replace(claim.key, None)
-    own, theirs = versions.get(app.version, versions[""]), newest_asked(others, app.id, versions)
-    if own.rank == theirs.rank:
-        return
-    holders, held = "", ""
-    for other in others.claims_on(app.subject):
-        word = other.application.version
-        if versions.get(word, versions[""]).rank == theirs.rank:
-            holders, held = ", ".join(other.requesters), word if word in versions else ""
-            break
-    message = (
-        f"{_version_text(app.version, own)} contradicts an existing claim: '{app.id}' is held by "
-        f"{holders} in {_version_text(held, theirs)}; request that version, or use another "
-        "application id"
-    )
-    difference = Difference(
-        f"application '{app.id}'",
-        app.appdef,
-        after.config.appdefs[app.appdef].versions,
-        own.name,
-        theirs.name,
-        own.rank > theirs.rank,
-        item.fault("version", message, code="conflict"),
-    )
-    if difference.matters_to(app.version):
-        yield difference
 
 
 def _version_text(word: str, version: ApplicationVersion) -> str:

@@ -132,7 +132,7 @@ class _Places(Generic[_Result]):
     def _whole_room(self) -> Room:
         request, ledger = self._request, self._state.ledger
         kept = (each for subject in request.subjects() for each in ledger.kept_claims(subject))
-        own = [*ledger.claims_of_demand(request.demand), *kept]
+        own = [*ledger.claims_with("demand", request.demand), *kept]
         nodes = {node for c in own if c.is_on_application for node in c.application.needed_nodes()}
         placed = Counter(app.node for app in request.applications if app.node)
         return Room(self._state, self._state.usage(), nodes, placed=placed)

@@ -56,7 +56,9 @@ def with_moved(
             replace(world, ledger=ledger), claim, move(claim.application)
         )
     demands = dict.fromkeys(claim.demand for claim in claims)
-    held = (c for old in (world.ledger, ledger) for d in demands for c in old.claims_of_demand(d))
+    held = (
+        c for old in (world.ledger, ledger) for d in demands for c in old.claims_with("demand", d)
+    )
     keys = list(dict.fromkeys(claim.key for claim in held))
     changes = claim_changes(world.ledger, ledger, keys)
     ledger, _ = carriers.without_idle_routes(ledger, world.config, changes)
@@ -308,7 +310,7 @@ def _faults(
         yield from collisions.faults_of_claim(claim, before, after, names)
         if not claim.is_on_application:
             former = change.before.connection.topics if change.before else ()
-            held = after.ledger.claims_of_demand(claim.demand)
+            held = after.ledger.claims_with("demand", claim.demand)
             apps = [each.application for each in held if each.is_on_application]
             for index, words in carriers.chosen_twice(claim.connection, apps, after.ledger):
                 if claim.connection.topics[index] not in former:

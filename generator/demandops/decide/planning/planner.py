@@ -35,36 +35,54 @@ from demandops.model.ledger.ledger import World
 from demandops.model.release import Autoscaler, Release, ServiceKey, ServiceRelease
 
 
-def plan(world: World, key: ReleaseKey) -> Release | None:
+def plan(world: World, key: ReleaseKey, *, shaped: bool = True) -> Release | None:
     """Return the release at ``key``, or ``None`` if no claim needs it or an override denies it.
+
+    Without ``shaped``, it is the release without the effects of overrides on it.
 
     Raises:
         Refused: if claims contradict each other, if a value of a parameter cannot be used, or if
             the configuration no longer has what a claim needs.
     """
     world = without_suspended(world)
-    release = _unshaped(world, key)
-    return overrides.apply_overrides(release, world) if release else None
-
-
-def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
-    world = without_suspended(world)
-    release = _unshaped(world, key)
-    override = overrides.service_denied_by(release, world) if release else None
-    return (release, override) if release and override else None
-
-
-def _unshaped(world: World, key: ReleaseKey) -> Release | None:
     config = world.config
     if not isinstance(key, ServiceKey):
-        return key.type.client(key, _ClaimedConnections(world, key.type), config)
+        client = key.type.client(key, _ClaimedConnections(world, key.type), config)
+        return overrides.apply_overrides(client, world) if client and shaped else client
     if not (claims := release_keys.claims_needing(world, key)):
         return None
-    apps = [claim.application for claim in claims]
-    first = world.ledger.application(apps[0].id) or apps[0]
-    service = release_keys.services_of(config, first.appdef)[key.service]
+    claimed: dict[str, list[Application]] = {}
+    for claim in claims:
+        claimed.setdefault(claim.subject.id, []).append(claim.application)
+    # Claims on one application may differ if a person wrote one of them. Its first claim decides
+    # the appdef and the nodes, for all of them alike.
+    firsts = [world.ledger.application(id) or apps[0] for id, apps in claimed.items()]
+    service = release_keys.services_of(config, firsts[0].appdef)[key.service]
     node, domain = config.node_and_domain(key.node)
-    parts = list(_parts(world, service, key, apps))
+    # each application once, with only the inputs that the instance depends on
+    parts, further = list[Application](), False
+    if service.root is not None:
+        source, name = str(key.source), str(key.topic)
+        given = (claim.application.inputs_from(service.root, source, name) for claim in claims)
+        rooted = [topic for topics in given for topic in topics]
+        type = min((topic.type for topic in rooted if topic.type), default="")
+        further = all(topic.further for topic in rooted)
+        shared = {service.root: (InputTopic(name, source, type, further),)}
+        # if all applications give the instance only this one topic, one of them is enough
+        needed = firsts if len(service.inputs) > 1 else firsts[:1]
+        parts = [first.with_inputs(shared) for first in needed]
+    else:
+        for first, same in zip(firsts, claimed.values(), strict=True):
+            own = {
+                role: {
+                    topic
+                    for app in same
+                    for topic in app.inputs.get(role, ())
+                    if not service.roots or topic.source == key.node
+                }
+                for role in service.roots or {role for app in same for role in app.inputs}
+            }
+            parts.append(first.with_inputs({role: tuple(topics) for role, topics in own.items()}))
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for role in sorted(service.inputs):
         read = set[InputTopic]()
@@ -80,11 +98,9 @@ def _unshaped(world: World, key: ReleaseKey) -> Release | None:
         giving = [claim for claim in claims if name in claim.application.parameters]
         parameters[name] = _merged_value(name, parameter, giving) if giving else parameter.default
     requesters = requesters_of(claims)
-    further = service.root is not None and parts[0].inputs[service.root][0].further
-    applications = tuple(dict.fromkeys(app.id for app in apps))
-    version = release_keys.version_of_service(world, service, applications)
+    version = release_keys.version_of_service(world, service, claimed)
     topics = [topic for role_topics in inputs.values() for topic in role_topics]
-    return ServiceRelease(
+    release = ServiceRelease(
         key=key,
         name=service_name(config, service, key),
         node=node,
@@ -96,45 +112,16 @@ def _unshaped(world: World, key: ReleaseKey) -> Release | None:
         outputs=MappingProxyType(outputs(config, service, key, further=further)),
         parameters=MappingProxyType(parameters),
         replicas=_replicas_of(service.scaling, parameters, topics, claims, requesters),
-        applications=applications,
+        applications=tuple(claimed),
         requesters=requesters,
     )
+    return overrides.apply_overrides(release, world) if shaped else release
 
 
-def _parts(
-    world: World, service: Service, key: ServiceKey, apps: Iterable[Application]
-) -> Iterator[Application]:
-    """Yield each application once, with only the inputs that the instance depends on."""
-    claimed: dict[str, list[Application]] = {}
-    for app in apps:
-        claimed.setdefault(app.id, []).append(app)
-    shared: dict[str, tuple[InputTopic, ...]] = {}
-    if service.root is not None:
-        source, name = str(key.source), str(key.topic)
-        topics = [topic for app in apps for topic in app.inputs_from(service.root, source, name)]
-        type = min((topic.type for topic in topics if topic.type), default="")
-        further = all(topic.further for topic in topics)
-        shared = {service.root: (InputTopic(name, source, type, further),)}
-    for same in claimed.values():
-        # Claims on one application may differ if a person wrote one of them. Its first claim
-        # decides the appdef and the nodes, for all of them alike.
-        first = world.ledger.application(same[0].id) or same[0]
-        if shared:
-            yield first.with_inputs(shared)
-            if len(service.inputs) == 1:
-                return  # all applications give the instance this one topic, so one is enough
-            continue
-        roles = service.roots or {role for app in same for role in app.inputs}
-        inputs = {
-            role: {
-                topic
-                for app in same
-                for topic in app.inputs.get(role, ())
-                if not service.roots or topic.source == key.node
-            }
-            for role in roles
-        }
-        yield first.with_inputs({role: tuple(topics) for role, topics in inputs.items()})
+def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
+    release = plan(world, key, shaped=False)
+    override = release and overrides.service_denied_by(release, without_suspended(world))
+    return (release, override) if release and override else None
 
 
 def demanded_inputs(
