@@ -18,10 +18,10 @@ from demandops.connections.connection import ConnectionType, Route
 from demandops.decide import booking, changeset, decision, edits
 from demandops.decide.admission import completing, permission
 from demandops.decide.checks import forbidden
+from demandops.decide.checks.forbidden import Usage
 from demandops.decide.decision import Decision
-from demandops.decide.placement import capacity, placement
+from demandops.decide.placement import placement
 from demandops.decide.placement.candidates import Choice
-from demandops.decide.placement.capacity import Usage
 from demandops.decide.planning import overrides, planner, release_keys
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Lease
@@ -230,7 +230,7 @@ plant("let_others_overtake_in_a_batch", 7, Agenda, "book_those_let_in", nothing)
 plant("leave_drained_nodes_full", 9, agenda, "_to_drain", lambda *_: [])
 plant("place_on_drained_nodes", 12, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 1, placement, "_booked", nothing)
-plant("count_no_room", 7, capacity, "excesses", lambda *_: [])
+plant("count_no_room", 7, forbidden, "excesses", lambda *_: [])
 
 
 @wrong(0, Usage, "plus")

@@ -28,7 +28,7 @@ from demandops.decide.booking import Drain, Restoration, apply, restoration_faul
 from demandops.decide.changeset import Changeset, FileReader, PlannedChange, ReleaseChange
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.forbidden import Difference
-from demandops.decide.placement import capacity, placement, relocation
+from demandops.decide.placement import placement, relocation
 from demandops.decide.placement.candidates import NO_ROOM
 from demandops.decide.planning import flows
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
@@ -419,8 +419,8 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
     differing = [*forbidden.differences(request, state, after, changes.claims, planned.plans)]
     if refused := [difference.fault for difference in differing if difference.is_refused]:
         raise Refused(refused)
-    grown = capacity.growth(planned.former, planned.plans, state.config)
-    refusal = capacity.NoRoom(state.usage(), grown, state.config)
+    grown = forbidden.growth(planned.former, planned.plans, state.config)
+    refusal = forbidden.NoRoom(state.usage(), grown, state.config)
     # a drain was tried on its nodes already, and what releases claims makes room
     if refusal.full and (request.adds_claims or isinstance(request, Restoration)):
         raise refusal

@@ -15,8 +15,6 @@ from demandops.decide.admission import admission, permission
 from demandops.decide.booking import request_for
 from demandops.decide.changeset import Changeset, FileReader
 from demandops.decide.checks import collisions, forbidden
-from demandops.decide.placement import capacity
-from demandops.decide.placement.capacity import NoRoom
 from demandops.decide.placement.relocation import LedgerUpdate, following_overrides
 from demandops.decide.planning import overrides
 from demandops.decide.planning.release_keys import affected_keys, keys_of_claims
@@ -73,10 +71,10 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
         faults = list(collisions.name_faults(wanted, before, after, keys, changed, after.names()))
         without = replace(after, ledger=after.ledger.replace(change.key, change.before))
         with suppress(Refused):  # other checks report a claim that cannot be planned
-            grown = capacity.growth_by(without, after, [change])
+            grown = forbidden.growth_by(without, after, [change])
             # only growth is a fault: the nodes may be full because of other claims
             usage = after.usage().plus({need: -amount for need, amount in grown.items()})
-            faults += NoRoom(usage, grown, config).faults
+            faults += forbidden.NoRoom(usage, grown, config).faults
         for each in faults:
             yield each.within(claim_files.path_of(claim.key))
 

@@ -13,10 +13,9 @@ from rpds import HashTrieMap
 from demandops.base.errors import InvalidInput, OverLimit, Refused
 from demandops.decide import changeset
 from demandops.decide.booking import apply
-from demandops.decide.checks import collisions
+from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.collisions import Names
-from demandops.decide.placement import capacity
-from demandops.decide.placement.capacity import Usage
+from demandops.decide.checks.forbidden import Usage
 from demandops.decide.planning.overrides import apply_effects, effects_on
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
@@ -43,7 +42,7 @@ class State(World):
 
     def usage(self) -> Usage:
         """Return how much the services request; the first call counts all services."""
-        usage = capacity.whole_usage(self) if self._usage is None else self._usage
+        usage = forbidden.whole_usage(self) if self._usage is None else self._usage
         object.__setattr__(self, "_usage", usage)
         return usage
 
@@ -75,7 +74,7 @@ class State(World):
                 object.__setattr__(state, "_names", names)
         with suppress(Refused):
             if self._usage is not None:
-                usage = self._usage.plus(capacity.growth_by(self, state, changes))
+                usage = self._usage.plus(forbidden.growth_by(self, state, changes))
                 object.__setattr__(state, "_usage", usage)
         return state
 

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from demandops.base.errors import Refused
 from demandops.base.quantities import amount_of, amount_text
+from demandops.decide.checks.forbidden import whole_usage
 from demandops.decide.decision import Decision
-from demandops.decide.placement.capacity import whole_usage
 from demandops.decide.state import State
 from demandops.model.config.load import load
 from demandops.model.ledger.ledger import ClaimChange

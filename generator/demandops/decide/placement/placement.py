@@ -17,6 +17,7 @@ from typing import Generic, TypeVar
 from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
+from demandops.decide.checks.forbidden import NoRoom, Usage
 from demandops.decide.placement import candidates
 from demandops.decide.placement.candidates import (
     NO_ROOM,
@@ -27,7 +28,6 @@ from demandops.decide.placement.candidates import (
     lacks,
     requirement_of,
 )
-from demandops.decide.placement.capacity import NoRoom, Usage
 from demandops.decide.state import State
 from demandops.model.config.appdef import Service
 from demandops.model.demand.demand import Application, Demand, Item

@@ -16,9 +16,9 @@ from demandops.decide.admission import admission, permission
 from demandops.decide.booking import Drain, Restoration, conflicts, request_for
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.collisions import Names
-from demandops.decide.placement import candidates, capacity
+from demandops.decide.checks.forbidden import Need, Usage
+from demandops.decide.placement import candidates
 from demandops.decide.placement.candidates import Choice, Chosen, Room
-from demandops.decide.placement.capacity import Need, Usage
 from demandops.decide.planning import overrides
 from demandops.decide.planning.flows import flows, with_booked_outputs
 from demandops.decide.planning.release_keys import affected_keys
@@ -199,9 +199,9 @@ def _moved(
     followed = collisions.followed(names, world, after, affected_keys(world, after, changes))
     if faults := [*islice(_faults(world, after, changes, followed), 1)]:
         raise Refused(faults)
-    grown, host = capacity.growth_by(world, after, changes), world.config.host_of(chosen.node)
+    grown, host = forbidden.growth_by(world, after, changes), world.config.host_of(chosen.node)
     there = {need: amount for need, amount in grown.items() if need[0] == host}
-    if (refusal := capacity.NoRoom(usage, there, world.config)).full:
+    if (refusal := forbidden.NoRoom(usage, there, world.config)).full:
         raise refusal
     return after, followed, changes, grown
 

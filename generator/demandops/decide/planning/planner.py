@@ -15,7 +15,7 @@ from demandops.base import naming, strict_yaml
 from demandops.base.errors import Refused, suggestion
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection, ConnectionType, Route
-from demandops.connections.connection_types import route_faults
+from demandops.decide.admission.admission import route_faults
 from demandops.decide.planning import overrides, release_keys
 from demandops.decide.planning.flows import (
     is_bridged,
