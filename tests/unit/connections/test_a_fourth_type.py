@@ -45,7 +45,7 @@ RELAY_TEMPLATES = Path(__file__).parent / "relay"
 class RelayType(ConnectionType):
     """A connection type with one client at the target, for the topics of all its connections."""
 
-    name = "RELAY"
+    name, word = "RELAY", "relay"
     number = 7
     image = "relay"
     options = frozenset({"queue"})

@@ -6,7 +6,7 @@ check what the policy allows (:mod:`.permission`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 
 from demandops.base.errors import Fault, fault, sentences, suggestion
@@ -267,8 +267,8 @@ def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
 # ---- types of connections: whether one can carry a connection, and the first that can ----
 
 
-def _able(can: Callable[[ConnectionType], bool]) -> str:  # `MQTT or ROS`
-    return " or ".join(kind.name for kind in connection_types.CONNECTION_TYPES if can(kind))
+def _named(kinds: Iterable[ConnectionType]) -> str:  # `MQTT or ROS`
+    return " or ".join(kind.name for kind in kinds)
 
 
 # Every type supports these options
@@ -296,6 +296,7 @@ def _no_type_fault(connection: Connection, config: Config) -> Fault:
 
 
 def _type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
+    kinds = connection_types.CONNECTION_TYPES
     ends = {"source": connection.source, "target": connection.target}
     are_known = {*ends.values()} <= config.nodes.keys()  # the admission reports unknown nodes
     if kind.image not in config.images:
@@ -307,7 +308,7 @@ def _type_faults(kind: ConnectionType, connection: Connection, config: Config) -
     if kind.speaks_dds and are_known:
         for end, node in ends.items():
             if config.nodes[node].ros.rmw == "rmw_zenoh_cpp":
-                able = _able(lambda other: not other.speaks_dds)
+                able = _named(other for other in kinds if not other.speaks_dds)
                 message = (
                     f"'{node}' runs rmw_zenoh_cpp, but type {kind.name} needs DDS; use type "
                     f"{able}, or another rmw in {config.file_of(NODES_FILE, node)}"
@@ -318,19 +319,20 @@ def _type_faults(kind: ConnectionType, connection: Connection, config: Config) -
 
 
 def _broker_fault(field: str, kind: ConnectionType) -> Fault:
-    able = _able(lambda other: other.takes_broker)
+    able = _named(kind for kind in connection_types.CONNECTION_TYPES if kind.takes_broker)
     message = f"a broker is for {able} only, but the type is {kind.name}; leave the broker out"
     return fault(field, message)
 
 
 def route_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
+    kinds = connection_types.CONNECTION_TYPES
     for index, route in enumerate(connection.topics):
         if topic_problem(route.source) or topic_problem(route.target):
             continue  # the checks of the request report this topic
         where = f"topics[{index}]"
         for name in route.options():
             if name not in _ALWAYS and name not in kind.options:
-                able = _able(lambda other, name=name: name in other.options)
+                able = _named(other for other in kinds if name in other.options)
                 yield fault(
                     f"{where}.{name}",
                     f"{name} of '{route.source}' is not supported by {kind.name}; leave it out, or "
@@ -338,7 +340,7 @@ def route_faults(kind: ConnectionType, connection: Connection, config: Config) -
                 )
         yield from kind.route_faults(where, route, connection.key_of(route).sender, config)
         if route.source != route.target and not kind.renames:
-            able = _able(lambda other: other.renames)
+            able = _named(other for other in kinds if other.renames)
             yield fault(
                 f"{where}.target",
                 f"'{route.source}' cannot become '{route.target}', because {kind.name} keeps the "
