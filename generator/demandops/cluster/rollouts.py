@@ -27,8 +27,7 @@ from demandops.cluster.health import (
 from demandops.cluster.watches import ObjectCache, object_caches
 from demandops.decide.decision import Decision
 from demandops.decide.planning.overrides import without_suspended
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import affected_keys, keys_of_claims
+from demandops.decide.planning.planner import affected_keys, keys_of_claims, plan
 from demandops.decide.state import State
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.repo_settings import RepoSettings

@@ -10,15 +10,13 @@ from itertools import chain
 
 from demandops.base.errors import Fault, Refused
 from demandops.base.naming import Subject
-from demandops.decide import changeset
 from demandops.decide.admission import admission, permission
 from demandops.decide.booking import request_for
-from demandops.decide.changeset import Changeset, FileReader
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.placement.relocation import LedgerUpdate, following_overrides
 from demandops.decide.planning import overrides
-from demandops.decide.planning.release_keys import affected_keys, keys_of_claims
-from demandops.decide.state import State
+from demandops.decide.planning.planner import affected_keys, keys_of_claims
+from demandops.decide.state import Changeset, FileReader, State, plan_change, render_change
 from demandops.model.config.override import Override, format_time
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
@@ -40,9 +38,9 @@ def changeset_of_edit(
 ) -> Changeset:
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
-    planned = changeset.plan_change(old, state, Changes(), keys, read)
+    planned = plan_change(old, state, Changes(), keys, read)
     # a template that takes too long is no fault of the claim, so its release keeps its file
-    return changeset.render_change(planned, state.config, state.evaluate, read, keeps_late=True)
+    return render_change(planned, state.config, state.evaluate, read, keeps_late=True)
 
 
 def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:

@@ -13,8 +13,7 @@ import pytest
 from demandops.base.errors import Refused
 from demandops.decide.booking import Drain
 from demandops.decide.placement.relocation import with_moves
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import all_keys
+from demandops.decide.planning.planner import all_keys, plan
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Application, Requirement
 from demandops.model.release import ServiceRelease

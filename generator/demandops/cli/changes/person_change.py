@@ -27,14 +27,14 @@ from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import formats, target
 from demandops.cli.output import done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.commits import differences, entry_lines, release_lines
-from demandops.decide.changeset import (
+from demandops.decide.planning.overrides import suspended_claims
+from demandops.decide.state import (
     FileChange,
     ReleaseChange,
+    State,
     describe_change,
     planned_releases,
 )
-from demandops.decide.planning.overrides import suspended_claims
-from demandops.decide.state import State
 from demandops.model.ledger.claim import requesters_of
 from demandops.model.release import Release, claims_of
 from demandops.render import gitops

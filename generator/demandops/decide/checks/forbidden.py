@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
@@ -17,17 +16,20 @@ from demandops.base.errors import Fault, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quantities import amount_of, amount_text
 from demandops.connections.connection import Connection
-from demandops.decide.planning import overrides, release_keys
+from demandops.decide.planning import overrides
 from demandops.decide.planning.overrides import Traits, fits, without_suspended
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import (
+from demandops.decide.planning.planner import (
     ReleaseKey,
     affected_keys,
+    claims_needing,
     contents,
     is_needed,
     keys_of,
     keys_of_claims,
     newest_asked,
+    planned,
+    running_version,
+    version_of_service,
 )
 from demandops.model.config.appdef import VersionPolicy
 from demandops.model.config.base_model import matches
@@ -227,7 +229,7 @@ def whole_usage(world: World) -> Usage:
         return Usage()
     apps = (each for each in world.ledger.claims if each.kind is SubjectKind.APPLICATION)
     keys = dict.fromkeys(key for app in apps for key in keys_of(world, app))
-    return Usage().plus(requests(_plan_leniently(world, keys), world.config))
+    return Usage().plus(requests(planned(world, keys), world.config))
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
@@ -242,16 +244,8 @@ def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> di
     if not after.config.limits_capacity:
         return {}
     keys = affected_keys(before, after, changes)
-    planned = _plan_leniently(before, keys), _plan_leniently(after, keys)
-    return growth(*planned, after.config)
-
-
-def _plan_leniently(world: World, keys: Iterable[ReleaseKey]) -> Plans:
-    planned: dict[ReleaseKey, Release | None] = dict.fromkeys(keys)
-    for key in planned:
-        with suppress(Refused):  # a release that cannot be planned requests nothing
-            planned[key] = plan(world, key)
-    return planned
+    # a release that cannot be planned requests nothing
+    return growth(planned(before, keys), planned(after, keys), after.config)
 
 
 def requests(plans: Plans, config: Config) -> Counter[Need]:
@@ -421,24 +415,22 @@ def _of_service(
 ) -> Iterator[Difference]:
     """Yield the differences of demanded applications, each with the version it asks for."""
     service, key, config = release.service, release.key, after.config
-    versions = {id: release_keys.running_version(after, id) for id in release.applications}
+    versions = {id: running_version(after, id) for id in release.applications}
     if len({contents(version, service) for version in versions.values() if version}) == 1:
         return
     for_what = f"for {key.topic} of '{key.source}'" if key.topic else f"on '{key.node}'"
     what = f"{key.service} {for_what}"
     for id, (item, asked) in demanded.items():
         others = [other for other in versions if other != id]
-        own, theirs = versions.get(id), release_keys.version_of_service(after, service, others)
+        own, theirs = versions.get(id), version_of_service(after, service, others)
         if own is None or contents(own, service) == contents(theirs, service):
             continue
         # The difference was there before the demand.
-        former = release_keys.running_version(before, id)
+        former = running_version(before, id)
         if (
             former
             and former.rank == own.rank
-            and any(
-                claim.application.id == id for claim in release_keys.claims_needing(before, key)
-            )
+            and any(claim.application.id == id for claim in claims_needing(before, key))
         ):
             continue
         # Versions of two definitions have names of their own, so the charts are compared.

@@ -22,7 +22,7 @@ from demandops.decide.checks import forbidden
 from demandops.decide.checks.forbidden import Need, NoRoom, Usage
 from demandops.decide.planning.flows import instances, version_of_instance
 from demandops.decide.planning.overrides import with_overridden_nodes
-from demandops.decide.planning.release_keys import is_needed
+from demandops.decide.planning.planner import is_needed
 from demandops.model.config import inventory
 from demandops.model.config.appdef import Place, Service
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config

@@ -21,7 +21,7 @@ from demandops.decide.placement import candidates
 from demandops.decide.placement.candidates import Choice, Chosen, Room
 from demandops.decide.planning import overrides
 from demandops.decide.planning.flows import flows, with_booked_outputs
-from demandops.decide.planning.release_keys import affected_keys
+from demandops.decide.planning.planner import affected_keys
 from demandops.model.config.appdef import Service
 from demandops.model.demand.demand import Application, Demand, InputTopic, Item, Requirement
 from demandops.model.ledger.claim import Claim, ClaimKey, requesters_of
