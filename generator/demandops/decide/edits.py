@@ -90,19 +90,24 @@ def update_ledger(
     subjects: Iterable[Subject],
     markers: Mapping[str, str],
     now: datetime,
+    *,
+    ending: Iterable[Override] = (),
 ) -> LedgerUpdate:
     """Return the ledger that a change of the configuration requires, and the files to write.
 
     ``subjects`` are those whose claims a person changed. ``markers`` are the ledger's markers of
-    ended overrides, by path.
+    ended overrides, by path. ``ending`` are overrides whose end the generator commits now.
     """
     # An override that is merged after its end never applies. One that was in effect before stays
     # in effect until the generator's own commit ends it.
     in_effect = {override.name: override.end for override in before.overrides}
     expired = [
-        override
-        for override in expired_overrides(after, now)
-        if override.name not in in_effect or in_effect[override.name] != override.end
+        *ending,
+        *(
+            override
+            for override in expired_overrides(after, now)
+            if override.name not in in_effect or in_effect[override.name] != override.end
+        ),
     ]
     stale = records.stale_markers(markers, after.config.overrides)
     ended = {
@@ -136,16 +141,6 @@ def update_claims(
     keys = (*kept, *moved.keys)
     files = changed_claim_files(after.ledger, moved.ledger, keys)
     return replace(moved, keys=keys, files=files)
-
-
-def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
-    if override.end is None:
-        raise ValueError(f"{override.path} has no end")
-    ended = {**world.ledger.ended, override.name: format_time(override.end)}
-    after = replace(world, ledger=replace(world.ledger, ended=ended))
-    update = update_ledger(world, after, (), {}, now)
-    marker = {records.ended_override_path(override.name): records.ended_override_text(override)}
-    return replace(update, files={**update.files, **marker})
 
 
 def changed_claim_files(
