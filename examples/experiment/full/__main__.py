@@ -11,18 +11,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from tests.kit.browser import chromium
-from tests.kit.detection import write_bag
-
-from . import crowd, report, routes
-from .bags import bag_tracks
+from . import large, report, routes
 from .checks import checks
 from .experiment import ROOT, Experiment
 from .fleet import Carrier
-from .large import LargeExperiment
-from .measures import STAGES, quantiles, savings, steps
-from .outcome import Outcome, Settings
-from .rules import Near
+from .outcome import STAGES, Outcome, Settings, quantiles, savings, steps
+from .rig import chromium, write_bag
+from .rules import Near, bag_tracks
 
 
 def _settings() -> Settings:
@@ -56,9 +51,9 @@ def main() -> int:
         print(f"{time.monotonic() - began:6.1f} s  {text}", flush=True)
 
     if settings.large:
-        large = LargeExperiment(settings, folder, say)
-        outcome = large.run()
-        found = crowd.checks(outcome, large.passing)
+        crowd = large.LargeExperiment(settings, folder, say)
+        outcome = crowd.run()
+        found = large.checks(outcome, crowd.passing)
     else:
         outcome = Experiment(settings, folder, say).run()
         found = checks(outcome)

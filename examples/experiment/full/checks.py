@@ -6,12 +6,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from examples.experiment import paper
-from tests.e2e.common.expected import FUSION
 
 from . import fleet
-from .measures import steps
-from .outcome import Outcome
+from .outcome import Outcome, steps
 from .participants import EGO_DATA
+from .rig import FUSION
 from .routes import VEHICLES
 
 _SLACK_S = 3.0
@@ -60,7 +59,7 @@ def _requesters(outcome: Outcome) -> Iterator[str]:
     inside: set[str] = set()
     for formed in outcome.formed:
         inside ^= {formed.vehicle}
-        if fault := differ(fleet.requesters(inside), formed.bookkeeping):
+        if fault := differ(paper.requesters(inside), formed.bookkeeping):
             yield f"{formed}: {fault}"
 
 

@@ -15,22 +15,25 @@ from pathlib import Path
 from typing import Any
 
 from examples.experiment import paper
-from tests.e2e.common.answers import limited_world
-from tests.e2e.common.expected import CLUSTER
-from tests.e2e.common.ros import Client
-from tests.e2e.common.world import World, demandops, environment
-from tests.e2e.rig import launch
-from tests.e2e.rig.cluster import Rig
-from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import git
-from tests.kit.ros import reserved
 
 from . import fleet, routes
-from .broker import Broker
-from .observers import CloudObserver, EdgeObserver
+from .observers import Broker, CloudObserver, EdgeObserver
 from .outcome import Formed, Outcome, Settings
 from .participants import POSE, Plan
 from .process_runner import ProcessRunner
+from .rig import (
+    CLUSTER,
+    PATIENCE_S,
+    Client,
+    Rig,
+    World,
+    demandops,
+    environment,
+    git,
+    launch,
+    limited_world,
+    reserved,
+)
 from .rules import Event, Near, Pose, causes, events_of, poses_in, predicted
 from .standins import image
 

@@ -11,11 +11,9 @@ from typing import Any, Literal
 import yaml
 
 from examples.experiment.paper import S
-from tests.e2e.rig.net import free_port
-from tests.kit import goals
-from tests.kit.config import override
 
 from .participants import POSE, STATION_CLOUD
+from .rig import free_port, override
 from .routes import VEHICLES
 from .rules import RULES
 
@@ -88,35 +86,21 @@ def is_client(service: str, vehicle: str, carrier: Carrier) -> bool:
 
 def initial_deployment(vehicles: Collection[str]) -> dict[str, Any]:
     """Return the goal that brings every vehicle's poses to the cloud, for the detector."""
+    poses = {vehicle: [POSE.format(vehicle)] for vehicle in vehicles}
     carried = [
-        goals.connection(
-            f"{vehicle}/cloud",
-            who=["operator"],
-            ends=(vehicle, "cloud"),
-            topics=[POSE.format(vehicle)],
-            broker="cloud",
-        )
-        for vehicle in vehicles
+        {
+            "id": f"{vehicle}/cloud",
+            "type": 1,
+            "broker_node_id": "cloud",
+            "requester_ids": ["operator"],
+            "source_node_id": vehicle,
+            "source_topics": topics,
+            "target_node_id": "cloud",
+            "target_topics": topics,
+        }
+        for vehicle, topics in poses.items()
     ]
-    return goals.goal([], carried, id="initial-deployment")
-
-
-def requesters(
-    inside: Collection[str], edge: str = "edge", station: str = S
-) -> dict[str, list[str]]:
-    """Extend the paper's table to any set of vehicles, and to another intersection."""
-    if not inside:
-        return {}
-    everybody = sorted({station, *inside})
-    rows = {
-        f"connection {station} to {edge}": everybody,
-        f"object-detection {station}": everybody,
-        f"object-fusion {edge}/object_detection_fusion": everybody,
-    }
-    rows |= {f"connection {vehicle} to {edge}": sorted({station, vehicle}) for vehicle in inside}
-    if VEHICLES[0] in inside:
-        rows[f"object-detection {VEHICLES[0]}"] = sorted({station, VEHICLES[0]})
-    return dict(sorted(rows.items()))
+    return {"id": "initial-deployment", "apps": [], "connections": carried, "shutdown": False}
 
 
 def fusion_inputs(inside: Collection[str]) -> frozenset[str]:

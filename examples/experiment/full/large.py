@@ -9,20 +9,138 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from tests.e2e.common.access import access_file, documented_roles, limited
-from tests.e2e.common.expected import CLUSTER, WITHOUT_DEMANDS
-from tests.e2e.rig.cluster import Rig
-from tests.kit.repo import git
-from tests.kit.ros import reserved
+import yaml
 
-from . import crowd
+from examples.experiment import paper
+
+from .checks import Check, check_nodes, differ
 from .experiment import Experiment, Say
 from .observers import CloudObserver
 from .outcome import Formed, Outcome, Settings
 from .process_runner import ProcessRunner
+from .rig import (
+    CLUSTER,
+    WITHOUT_DEMANDS,
+    Rig,
+    access_file,
+    documented_roles,
+    git,
+    limited,
+    reserved,
+)
+from .routes import MIDDLES
+from .rules import RULES, Event, Near, Pose, events_of
+
+FLEET = "vehicles"
+"""The cluster of the vehicles; all other nodes are in the skeleton's cluster."""
+EDGES = tuple(f"edge{number:02}" for number in range(len(MIDDLES)))
+STATIONS = tuple(f"station{number:02}" for number in range(len(MIDDLES)))
+NODES = (*EDGES, *STATIONS, "cloud")
+
+
+def crossings(near: Near) -> tuple[Near, ...]:
+    """Return a nearness condition for each intersection; the first one is the paper's condition."""
+    (x, y) = near.point
+    return tuple(replace(near, point=(x + dx, y + dy)) for dx, dy in MIDDLES)
+
+
+def files(vehicles: Collection[str], clusters: str) -> dict[str, str]:
+    """Return the inventory's texts by path; `clusters` is the skeleton's `clusters.yaml`."""
+    places: dict[str, Any] = yaml.safe_load(clusters)
+    places["clusters"].append({"name": FLEET})
+    kinds = dict.fromkeys(vehicles, "vehicle") | {node: node.rstrip("0123456789") for node in NODES}
+    nodes = [
+        {"id": node, "type": kind, "cluster": FLEET if kind == "vehicle" else CLUSTER}
+        for node, kind in kinds.items()
+    ]
+    brokers = [{"node": edge, "host": edge, "port": 1883} for edge in EDGES]
+    head = {"apiVersion": "demandops/v1"}
+    return {
+        "inventory/clusters.yaml": yaml.safe_dump(places),
+        "inventory/nodes.yaml": yaml.safe_dump({**head, "kind": "Nodes", "nodes": nodes}),
+        "inventory/brokers.yaml": yaml.safe_dump({**head, "kind": "Brokers", "brokers": brokers}),
+    }
+
+
+def rules(near: Near) -> str:
+    """Return the example's last rule, for vehicles without a lidar, for each intersection."""
+    found: dict[str, Any] = yaml.safe_load(RULES.read_text())
+    text = yaml.safe_dump(found["rules"][-1])
+    found["rules"] = []
+    for number, crossing in enumerate(crossings(near)):
+        rule = yaml.safe_load(text.replace("station00", STATIONS[number]))
+        rule = yaml.safe_load(
+            yaml.safe_dump(rule)
+            .replace("/edge", f"/{EDGES[number]}")
+            .replace(": edge\n", f": {EDGES[number]}\n")
+            .replace("edge/", f"{EDGES[number]}/")
+        )
+        x, y = crossing.point
+        rule |= {"name": f"at-{STATIONS[number]}", "entities": ["vehicle*"]}
+        rule["near"]["point"] = {"x": x, "y": y}
+        found["rules"].append(rule)
+    return yaml.safe_dump(found)
+
+
+def crossing_events(
+    poses: Iterable[Pose], passing: Mapping[str, Near], until: float
+) -> list[Event]:
+    """Return the events before `until` in order; `passing` maps vehicles to their intersections."""
+    own: defaultdict[Near, list[Pose]] = defaultdict(list)
+    for pose in poses:
+        own[passing[pose.vehicle]].append(pose)
+    found = [event for near, some in own.items() for event in events_of(some, near, until)]
+    return sorted(found, key=lambda event: event.at)
+
+
+def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
+    """Return the requesters while each vehicle is near the intersection of this number."""
+    rows: dict[str, list[str]] = {}
+    for number, (edge, station) in enumerate(zip(EDGES, STATIONS, strict=True)):
+        near = [vehicle for vehicle, at in inside.items() if at == number]
+        rows |= paper.requesters(near, edge, station)
+    return dict(sorted(rows.items()))
+
+
+def checks(outcome: Outcome, passing: Mapping[str, int]) -> list[Check]:
+    """Return the checks of a run in which no container runs and no data flows."""
+    return [
+        Check("the detector formed the demands that a plain script over the poses gives",
+              differ(_by_vehicle(outcome.events), _by_vehicle(outcome.formed))),
+        Check("at the commits whose bookkeeping was read, the requesters of every service and "
+              "connection are right", "; ".join(_requesters(outcome.formed, passing))),
+        Check("every pod ran on the node that it was for", "; ".join(check_nodes(outcome))),
+        Check("at the end both clusters are as before",
+              differ(sorted(outcome.before), sorted(outcome.left))),
+    ]  # fmt: skip
+
+
+def _by_vehicle(found: Iterable[Event] | Iterable[Formed]) -> dict[str, list[bool]]:
+    """Return each vehicle's joins (true) and leaves (false) in order."""
+    by_vehicle: defaultdict[str, list[bool]] = defaultdict(list)
+    for one in found:
+        by_vehicle[one.vehicle].append(one.joins)
+    return dict(sorted(by_vehicle.items()))
+
+
+def _requesters(formed: Iterable[Formed], passing: Mapping[str, int]) -> Iterator[str]:
+    inside: dict[str, int] = {}
+    for one in formed:
+        if one.joins:
+            inside[one.vehicle] = passing[one.vehicle]
+        else:
+            inside.pop(one.vehicle, None)
+        if one.bookkeeping is not None and (fault := differ(requesters(inside), one.bookkeeping)):
+            yield f"{one}: {fault}"
+
+
+# ---- the run ----
 
 _LOOKS = 12
 """The run records the whole bookkeeping at about this many of its commits.
@@ -45,7 +163,7 @@ class PodWatch(ProcessRunner):
 class LargeExperiment(Experiment):
     def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
         super().__init__(settings, folder, say)
-        self._crossings = crowd.crossings(self._near)
+        self._crossings = crossings(self._near)
         places = [crossing.point for crossing in self._crossings]
         origin = self._near.point
         self.passing = {
@@ -55,17 +173,17 @@ class LargeExperiment(Experiment):
 
     def _start_cluster(self) -> None:
         vehicles = [route.vehicle for route in self._routes]
-        self._rig = self._stack.enter_context(Rig(CLUSTER, nodes=crowd.NODES, report=self._say))
-        fleet = self._stack.enter_context(Rig(crowd.FLEET, nodes=vehicles, git_of=self._rig))
-        self._rigs = {CLUSTER: self._rig, crowd.FLEET: fleet}
+        self._rig = self._stack.enter_context(Rig(CLUSTER, nodes=NODES, report=self._say))
+        fleet = self._stack.enter_context(Rig(FLEET, nodes=vehicles, git_of=self._rig))
+        self._rigs = {CLUSTER: self._rig, FLEET: fleet}
         self._domains = {"cloud": self._stack.enter_context(reserved())}
-        self._say(f"two clusters are up, with {len(vehicles) + len(crowd.NODES)} nodes")
+        self._say(f"two clusters are up, with {len(vehicles) + len(NODES)} nodes")
 
     def _start_fleet(self) -> None:
         world = self._start_world()
-        world.push(crowd.files(self.passing.keys(), world.file("inventory/clusters.yaml")))
+        world.push(files(self.passing.keys(), world.file("inventory/clusters.yaml")))
         world.generator.start()
-        bootstrap = f"bootstrap/{crowd.FLEET}.yaml"
+        bootstrap = f"bootstrap/{FLEET}.yaml"
         self._wait("the second cluster's bootstrap file", lambda: self._exists(bootstrap))
         access, self._watches = {}, []
         for name, rig in self._rigs.items():
@@ -86,7 +204,7 @@ class LargeExperiment(Experiment):
     def _deploy_initially(self) -> None:
         self._start_participants("", poses_only=True)
         self._before = self._lines()
-        self._detect(crowd.rules(self._near))
+        self._detect(rules(self._near))
 
     def _drive(self) -> Outcome:
         first = self._world.tip()
@@ -97,7 +215,7 @@ class LargeExperiment(Experiment):
         deadline = time.monotonic() + last + 2 * self._near.timeout
         self._reaches(lambda: time.monotonic() > deadline, math.inf)
         passing = {vehicle: self._crossings[at] for vehicle, at in self.passing.items()}
-        events = crowd.events(self._poses(), passing, time.time())
+        events = crossing_events(self._poses(), passing, time.time())
         self._wait("the last demands", lambda: len(self._commits(first)) >= len(events), 300)
         self._wait_until_as_before(300)
         return self._outcome(

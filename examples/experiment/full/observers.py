@@ -1,12 +1,16 @@
-"""ROS nodes that observe the ROS graphs of the edge and the cloud, and record what happens."""
+"""ROS nodes and an MQTT client that observe the fleet, and record what happens; and a broker."""
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 import time
 from collections import Counter, defaultdict
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
+import paho.mqtt.client as mqtt
 import rclpy
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.base.settings import DEFAULT_ACTION_NAME
@@ -16,10 +20,9 @@ from geometry_msgs.msg import PoseArray, PoseStamped
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
-from tests.e2e.common.expected import FUSION
-
 from .fleet import STATION_CLOUD_TARGET
 from .participants import EGO_DATA, POSE, VEHICLE_CLOUD
+from .rig import FUSION, PATIENCE_S, accepts, free_port, launch, wait_until
 from .routes import VEHICLES
 
 FUSION_NODE = FUSION.replace("-", "_")
@@ -115,3 +118,38 @@ class CloudObserver(Observer):
             for stages in list(self.stages.values())
             if "committed" in stages
         }
+
+
+# ---- MQTT ----
+
+
+class Broker:
+    """A mosquitto, and a client that counts the bytes of each topic."""
+
+    def __init__(self, folder: Path) -> None:
+        self.port = free_port()
+        self.bytes: Counter[str] = Counter()
+        program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+        assert program, "mosquitto is missing; run `setup/system e2e` as root to install it"
+        configuration = folder / "mosquitto.conf"
+        configuration.write_text(f"listener {self.port} 127.0.0.1\nallow_anonymous true\n")
+        with (folder / "mosquitto.log").open("w") as log:
+            self._process = subprocess.Popen(
+                launch.command(program, "-c", str(configuration)), stdout=log, stderr=log
+            )
+        self._counter = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
+        self._counter.on_connect = lambda client, *_: client.subscribe("#")
+        self._counter.on_message = self._count
+        answers = accepts(self.port)
+        wait_until(lambda: answers() is None or self._process.poll() is not None, "mosquitto")
+        self._counter.connect("127.0.0.1", self.port)
+        self._counter.loop_start()
+
+    def _count(self, _: object, __: object, message: Any) -> None:
+        self.bytes[message.topic] += len(message.payload)
+
+    def close(self) -> None:
+        self._counter.disconnect()
+        self._counter.loop_stop()
+        self._process.terminate()
+        self._process.wait(PATIENCE_S)

@@ -17,6 +17,7 @@ import os
 import random
 import select
 import signal
+import struct
 import sys
 import time
 from collections import Counter
@@ -30,8 +31,8 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import PointCloud2, PointField
 
-from . import clouds
 from .routes import STATION, VEHICLES, Route, Track, Way
 
 Place = tuple[float, float]
@@ -48,6 +49,34 @@ RANGE_M = 120.0
 """How far a lidar sees, in metres."""
 WITH_LIDAR = (VEHICLES[0],)
 """The vehicles that publish a point cloud, as in the paper."""
+
+_POINT = struct.Struct("<fff")
+_POINTS_PER_OBJECT = 40
+_SPREAD_M = 0.4
+
+
+def points_of(objects: Iterable[Place], chance: random.Random) -> list[tuple[float, float, float]]:
+    """Return random points around the centre (x, y) of each object; objects are as big as cars."""
+    return [
+        (chance.gauss(x, _SPREAD_M), chance.gauss(y, _SPREAD_M), chance.uniform(0.2, 1.6))
+        for x, y in objects
+        for _ in range(_POINTS_PER_OBJECT)
+    ]
+
+
+def cloud_message(points: list[tuple[float, float, float]]) -> PointCloud2:
+    """Return a cloud as a message in the frame `map`, without a stamp."""
+    message = PointCloud2()
+    message.header.frame_id = "map"
+    message.height, message.width = 1, len(points)
+    message.fields = [
+        PointField(name=name, offset=4 * number, datatype=PointField.FLOAT32, count=1)
+        for number, name in enumerate("xyz")
+    ]
+    message.point_step, message.row_step = _POINT.size, _POINT.size * len(points)
+    message.is_dense = True
+    message.data = b"".join(_POINT.pack(*point) for point in points)
+    return message
 
 
 @dataclass(frozen=True)
@@ -163,7 +192,7 @@ class Participants:
 
     def _cloud(self, at: Place, objects: Iterable[Place]) -> Any:
         near = [place for place in objects if math.dist(place, at) <= RANGE_M]
-        return clouds.to_message(clouds.points_of(near, self._chance))
+        return cloud_message(points_of(near, self._chance))
 
     def go(self) -> None:
         """Let the vehicles set off, and start to count bytes anew."""

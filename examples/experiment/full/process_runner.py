@@ -29,10 +29,7 @@ from kubernetes.client.exceptions import ApiException
 from kubernetes.watch import Watch
 from urllib3.exceptions import HTTPError
 
-from tests.e2e.common.volumes import files
-from tests.e2e.rig import launch
-from tests.e2e.rig.kube import Kube, Manifest
-from tests.kit.limits import PATIENCE_S
+from .rig import PATIENCE_S, Kube, Manifest, launch, volume_files
 
 _TICK_S = 0.1
 _WATCH_S = 60
@@ -236,7 +233,7 @@ class ProcessRunner:
         folder = pod.folder / volume["name"]
         folder.mkdir(parents=True, exist_ok=True)
         account = pod.manifest["spec"].get("serviceAccountName", "default")
-        for name, content in files(self._kube, self._namespace, account, volume).items():
+        for name, content in volume_files(self._kube, self._namespace, account, volume).items():
             new = folder / f".{name}"
             new.write_bytes(content)
             new.replace(folder / name)

@@ -12,8 +12,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from .checks import Check
-from .measures import STAGES, quantiles, running, steps
-from .outcome import Outcome
+from .outcome import STAGES, Outcome, quantiles, running, steps
 from .participants import EGO_DATA
 from .routes import FAR_M
 

@@ -1,7 +1,7 @@
 """The vehicles' routes through the intersection: made from a seed, or recorded.
 
-All functions are pure. The intersection, where the station is, is the origin of the map. Distances
-are in metres, times in seconds since the vehicles set off.
+The intersection, where the station is, is the origin of the map. Distances are in metres, times in
+seconds since the vehicles set off.
 """
 
 from __future__ import annotations

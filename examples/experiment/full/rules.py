@@ -8,13 +8,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
+from demandops.detect import rule_file
+from demandops_ros.detector.replay import RecordedBag
 
-from .routes import Way
+from .routes import LEAD_S, VEHICLES, Track, Way
 
 RULES = Path(__file__).resolve().parents[1] / "rules.yaml"
 
@@ -110,3 +113,32 @@ def _events(poses: list[Pose], near: Near, until: float) -> Iterator[Event]:
                 yield Event(pose.at, vehicle, is_near)
         if is_near and last + near.timeout < until:
             yield Event(last + near.timeout, vehicle, False)
+
+
+# ---- recorded poses ----
+
+
+def bag_tracks(bag: Path, near: Near) -> tuple[Track, ...]:
+    """Return the track of each vehicle in a bag, or end with the reason why it cannot be played."""
+    rules = rule_file.read(RULES.read_text(), RULES.name)
+    points: dict[str, list[tuple[float, float, float]]] = {}
+    first: float | None = None
+    with closing(RecordedBag(bag, rules)) as reader:
+        for one in reader.observations():
+            if one.position is not None:
+                first = one.at if first is None else first
+                x, y = one.position[0] - near.point[0], one.position[1] - near.point[1]
+                points.setdefault(one.entity, []).append((one.at - first + LEAD_S, x, y))
+    if others := points.keys() - set(VEHICLES):
+        raise SystemExit(
+            f"{bag}: has poses of {', '.join(sorted(others))}; the experiment has nodes for "
+            f"{', '.join(VEHICLES)} only, so rename the topics"
+        )
+    found = tuple(Track(vehicle, tuple(points[vehicle])) for vehicle in sorted(points))
+    for track in found:
+        if math.hypot(*track.position(0.0)) <= near.stop:
+            raise SystemExit(
+                f"{bag}: {track.vehicle} begins within {near.stop:g} m of the station; start the "
+                "recording earlier"
+            )
+    return found

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 from demandops.base import strict_yaml
-from demandops.base.errors import InvalidInput
 from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import ClusterDomain, ObjectSelector, Target
@@ -219,15 +218,6 @@ def test_data_of_a_deleted_config_map_stay_valid(
         f"{NAME} does not exist yet",
         f"{NAME} is gone; its last data stay valid",
     ]
-
-
-def test_without_a_kubeconfig_the_process_must_be_a_pod(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
-    with pytest.raises(InvalidInput) as refused:
-        ConfigMapWatch("perception", "of-params", print, None)
-    assert str(refused.value).startswith(
-        "without --kubeconfig: needs a pod with a service account's token: "
-    )
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ from dataclasses import replace
 from math import inf
 from pathlib import Path
 from threading import Event, Timer
-from time import monotonic
 
 import pytest
 from demandops.base.errors import InvalidInput
@@ -187,24 +186,6 @@ def test_a_new_kubeconfig_counts_at_the_next_try(
     kubeconfig(tmp_path, api.url)
     wait_until(lambda: api.patches, "the next try")
     waker.close()
-
-
-def test_two_calls_are_a_second_apart() -> None:
-    state, _ = start("experiment")
-    at: list[float] = []
-
-    def answer(call: Call) -> Answer:
-        at.append(monotonic())
-        return Answer()
-
-    with serving(answer) as server:
-        hook = ClusterAccess(receiver=f"{server.url}/hook/abc")
-        waker = ReconcileTrigger({"c-its": hook}, lambda since: ("", None))
-        for number in (1, 2):
-            waker(state.config)
-            wait_until(lambda: len(at) == number, f"call {number}")  # noqa: B023
-        waker.close()
-    assert at[1] - at[0] >= 1
 
 
 def test_an_odd_object_keeps_no_cluster_from_being_woken(api: KubeApi, tmp_path: Path) -> None:
