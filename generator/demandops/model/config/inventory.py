@@ -374,7 +374,7 @@ class Node(CamelModel):
             )
         return self
 
-    @cached_property
+    @cached_property  # a copy with another id has a selector, so that its labels stay right
     def labels(self) -> Mapping[str, str]:
         return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
 
