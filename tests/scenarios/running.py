@@ -15,9 +15,9 @@ from typing import Any, Literal
 import yaml
 from demandops.base.errors import Fault, Refused
 from demandops.decide.booking import Drain
+from demandops.decide.checks.forbidden import whole_usage
 from demandops.decide.decision import Decision, decide
 from demandops.decide.edits import changed_claim_files
-from demandops.decide.placement.capacity import whole_usage
 from demandops.decide.placement.relocation import following_overrides
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.base_model import FrozenModel, parse_file, seconds_of
