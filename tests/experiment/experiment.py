@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from examples.experiment import paper
-from tests.e2e.common.answers import limited_world
+from tests.e2e.common.access import limited_world
 from tests.e2e.common.expected import CLUSTER
 from tests.e2e.common.ros import Client
 from tests.e2e.common.world import World, demandops, environment
@@ -56,7 +56,8 @@ class Experiment:
             return self._drive()
 
     def _start_cluster(self) -> None:
-        rig = Rig(CLUSTER, gitops=self._settings.gitops, nodes=fleet.NODES, report=self._say)
+        folder, gitops = self._made("rig"), self._settings.gitops
+        rig = Rig(CLUSTER, folder, gitops=gitops, nodes=fleet.NODES, report=self._say)
         self._rig = self._stack.enter_context(rig)
         self._rigs = {CLUSTER: rig}
         self._say("the cluster is up")

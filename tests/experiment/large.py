@@ -55,8 +55,10 @@ class LargeExperiment(Experiment):
 
     def _start_cluster(self) -> None:
         vehicles = [route.vehicle for route in self._routes]
-        self._rig = self._stack.enter_context(Rig(CLUSTER, nodes=crowd.NODES, report=self._say))
-        fleet = self._stack.enter_context(Rig(crowd.FLEET, nodes=vehicles, git_of=self._rig))
+        first = Rig(CLUSTER, self._made("rig"), nodes=crowd.NODES, report=self._say)
+        self._rig = self._stack.enter_context(first)
+        second = Rig(crowd.FLEET, self._made("rig-fleet"), nodes=vehicles, git_of=first)
+        fleet = self._stack.enter_context(second)
         self._rigs = {CLUSTER: self._rig, crowd.FLEET: fleet}
         self._domains = {"cloud": self._stack.enter_context(reserved())}
         self._say(f"two clusters are up, with {len(vehicles) + len(crowd.NODES)} nodes")

@@ -1,10 +1,14 @@
 """Build the rig's programs from pinned Go modules, once, into a cache outside the checkout.
 
 The other modules of the rig take the paths that `ensure` returns. Each program is pinned by a Go
-module of its own under `tests/e2e/tools/`, whose `go.sum` covers all dependencies.
+module of its own under `tests/e2e/tools/`, its wrapper, whose `go.sum` covers all dependencies.
 
 The name of a cache entry is a digest of everything that decides the program's bytes. A finished
 entry is renamed into the cache, so each existing entry is complete.
+
+A build follows the committed `go.mod` and `go.sum`, and ignores the caller's Go settings. It uses
+the installed Go and fetches no toolchain. It runs at the lowest priority, because a build with an
+empty cache uses two cores for about twenty minutes.
 
 `python -m tests.e2e.rig.tools` builds all programs. With `--for flux` it builds the programs of a
 rig with Flux.
@@ -19,14 +23,14 @@ import json
 import os
 import re
 import shutil
+import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import gobuild
+from . import launch
 from .errors import RigError
 
 WRAPPERS = Path(__file__).resolve().parent.parent / "tools"
@@ -36,6 +40,8 @@ Report = Callable[[str], None]
 
 _ARGOCD = "github.com/argoproj/argo-cd/v3"
 _CRD_FOLDERS = ("config/crd/bases", "manifests/crds")  # Flux's, Argo CD's
+_SHOWN_LINES = 40
+_PACKAGES_AT_ONCE = 400
 
 
 @dataclass(frozen=True)
@@ -79,17 +85,18 @@ TOOLS = {
 def ensure(names: Iterable[str], report: Report | None = None) -> dict[str, Path]:
     """Return the paths of these programs, after building what the cache lacks; raise RigError."""
     wanted, say = list(names), report or _to_stderr
-    go = gobuild.Go.find()
-    entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], go)}" for name in wanted}
+    if shutil.which("go") is None:
+        raise RigError("tests/e2e/tools: `go` is not on PATH: `make go` installs it into build/")
+    go = _go(Path("/"), {}, "env", "GOVERSION", "GOOS", "GOARCH").splitlines()
+    entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], *go)}" for name in wanted}
     missing = [name for name in wanted if not entries[name].is_dir()]
     for place, name in enumerate(missing, start=1):
         with _turn(cache_root(), say):
             if not entries[name].is_dir():  # another run may have built it while we waited
-                workspace = gobuild.Workspace(cache_root() / f".go-{TOOLS[name].wrapper}")
                 say(f"building program {place} of {len(missing)}, {name}")
-                _build(TOOLS[name], go, entries[name], workspace, say)
+                _build(TOOLS[name], entries[name], say)
                 if TOOLS[name].wrapper not in [TOOLS[other].wrapper for other in missing[place:]]:
-                    workspace.remove()
+                    shutil.rmtree(_workspace(TOOLS[name]), ignore_errors=True)
     return {name: entries[name] / name for name in wanted}
 
 
@@ -104,20 +111,28 @@ def crd_files(binaries: dict[str, Path]) -> list[Path]:
 
 
 def cache_root() -> Path:
-    named = os.environ.get(CACHE_VARIABLE)
-    if named:
-        return Path(named).expanduser().resolve()
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser().resolve() / "demandops" / "e2e"
+    named = os.environ.get(CACHE_VARIABLE) or f"{base}/demandops/e2e"
+    return Path(named).expanduser().resolve()
 
 
-def _digest(tool: Tool, go: gobuild.Go) -> str:
+def _workspace(tool: Tool) -> Path:
+    """Return the folder of a wrapper's builds, with its sources and compiled packages.
+
+    The modules of all wrappers and their compiled packages would fill about 15 GB. So a workspace
+    keeps only the sources that its wrapper builds, in a vendor folder, and is removed after the
+    wrapper's last build.
+    """
+    return cache_root() / f".go-{tool.wrapper}"
+
+
+def _digest(tool: Tool, version: str, system: str, machine: str) -> str:
     """Return a digest of what decides a program's bytes: pins, flags, toolchain and target."""
-    folder = WRAPPERS / tool.wrapper
+    folder, target = WRAPPERS / tool.wrapper, f"{system}/{machine}"
     parts = [
         (folder / "go.mod").read_bytes(),
         (folder / "go.sum").read_bytes(),
-        json.dumps([tool.package, tool.crds_of, _flags(tool), go.version, go.target]).encode(),
+        json.dumps([tool.package, tool.crds_of, _flags(tool), version, target]).encode(),
     ]
     joined = b"\0".join(hashlib.sha256(part).digest() for part in parts)
     return hashlib.sha256(joined).hexdigest()[:16]
@@ -153,26 +168,51 @@ def _turn(root: Path, say: Report) -> Iterator[None]:
         yield
 
 
-def _build(
-    tool: Tool, go: gobuild.Go, entry: Path, workspace: gobuild.Workspace, say: Report
-) -> None:
-    staging = Path(tempfile.mkdtemp(prefix=f".building-{tool.name}-", dir=entry.parent))
+def _build(tool: Tool, entry: Path, say: Report) -> None:
+    workspace, staging = _workspace(tool), entry.parent / f".building-{entry.name}"
+    module, start = workspace / "wrapper", time.monotonic()
+    own = {"GOMODCACHE": workspace / "modules", "GOCACHE": workspace / "compiled"}
+
+    def go(*arguments: str) -> str:
+        return _go(module, own | {"GOTMPDIR": workspace}, *arguments)
+
+    staging.mkdir()
     try:
-        start, wrapper, binary = time.monotonic(), WRAPPERS / tool.wrapper, staging / tool.name
-        go.check(wrapper)
         say("fetching modules")
-        workspace.vendor(go, wrapper)
+        if not _is_vendored(module, WRAPPERS / tool.wrapper):
+            # a killed run may have left a folder with other versions
+            shutil.rmtree(workspace, ignore_errors=True)
+            shutil.copytree(WRAPPERS / tool.wrapper, module)
+            go("mod", "vendor", "-o", "fetched")  # this compares the sources with `go.sum`
+            (module / "fetched").rename(module / "vendor")
         if tool.crds_of:
-            _copy_crds(Path(gobuild.module_folder(go, workspace, tool.crds_of)), staging / "crds")
-        workspace.drop_modules()
-        gobuild.build(go, tool.package, _flags(tool), binary, workspace, say)
+            # it fetches them again if an earlier build was interrupted after it had dropped them
+            unpacked = json.loads(go("mod", "download", "-json", tool.crds_of))
+            _copy_crds(Path(unpacked["Dir"]), staging / "crds")
+        shutil.rmtree(workspace / "modules", ignore_errors=True)
+
+        flags = ["-mod=vendor", *_flags(tool)]
+        packages = go("list", *flags, "-deps", tool.package).split()
+        # Go keeps a second copy of what a command compiles until the command ends. So each command
+        # compiles only a part. Dependencies come before their users, so this costs no time.
+        others = [one for one in packages if "." in one.partition("/")[0] and one != tool.package]
+        for first in range(0, len(others), _PACKAGES_AT_ONCE):
+            say(f"compiling, {first} of {len(others)} packages done")
+            go("build", *flags, *others[first : first + _PACKAGES_AT_ONCE])
+        binary = staging / tool.name
+        go("build", *flags, "-o", str(binary), tool.package)
         with binary.open("rb") as written:
             os.fsync(written.fileno())  # otherwise a power cut could leave an empty file
-        staging.chmod(0o755)
         staging.rename(entry)
         say(f"built in {time.monotonic() - start:.0f} s")
     finally:
         shutil.rmtree(staging, ignore_errors=True)
+
+
+def _is_vendored(module: Path, wrapper: Path) -> bool:
+    pins = [folder / name for folder in (module, wrapper) for name in ("go.mod", "go.sum")]
+    texts = [path.read_bytes() if path.exists() else b"" for path in pins]
+    return (module / "vendor").is_dir() and texts[:2] == texts[2:]
 
 
 def _copy_crds(module: Path, target: Path) -> None:
@@ -183,6 +223,32 @@ def _copy_crds(module: Path, target: Path) -> None:
         raise RigError(f"{module}: no CRDs in {' or '.join(_CRD_FOLDERS)}; have they moved?")
     for source in sources:
         (target / source.name).write_bytes(source.read_bytes())  # copies no read-only mode
+
+
+def _go(folder: Path, own: dict[str, Path], *arguments: str) -> str:
+    # The linker strips debug information. Without it the compiler needs a third less disk space.
+    flags = "-mod=readonly -modcacherw -gcflags=all=-dwarf=false"
+    settings = {"GOTOOLCHAIN": "local", "GOWORK": "off", "CGO_ENABLED": "0", "GOFLAGS": flags}
+    # Settings for another system would give programs that do not run on this machine.
+    dropped = {"GOOS", "GOARCH", "GOEXPERIMENT", "GO111MODULE"}
+    kept = {key: value for key, value in os.environ.items() if key not in dropped}
+    done = subprocess.run(
+        launch.command(shutil.which("go") or "go", *arguments, niceness=19),
+        cwd=folder,
+        env=kept | settings | {key: str(path) for key, path in own.items()},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        lines = [
+            line for line in done.stderr.splitlines() if not line.startswith("go: downloading")
+        ]
+        told = "\n".join(f"  {line}" for line in lines[-_SHOWN_LINES:])
+        command = f"go {' '.join(arguments)}"
+        raise RigError(f"{folder}: `{command}` failed with {done.returncode}:\n{told}")
+    return done.stdout
 
 
 def _to_stderr(text: str) -> None:

@@ -9,25 +9,26 @@ import yaml
 
 from tests.e2e.common import expected
 from tests.e2e.common.expected import CLUSTER, NAMESPACE, NODES, STEPS, VEHICLES, WITHOUT_DEMANDS
+from tests.e2e.common.flux import SOURCE, FluxDomain
 from tests.e2e.common.world import World, running
 from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .view import SOURCE, Domain
-
+pytestmark = pytest.mark.only("flux", "the tests count the pulls of Flux")
 FLEET = "vehicles"
 OTHERS = tuple(node for node in NODES if node not in VEHICLES)
 CLUSTERS, INVENTORY = "inventory/clusters.yaml", "inventory/nodes.yaml"
 
 
 @pytest.fixture(scope="module")
-def fleet(rig: Rig, request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
+def fleet(rig: Rig, tmp_path_factory: pytest.TempPathFactory, say: Report) -> Iterator[Rig]:
     """A second cluster, for the vehicles; both clusters read the Git server of `rig`."""
-    cluster = Rig(FLEET, nodes=VEHICLES, git_of=rig, report=say)
+    folder = tmp_path_factory.mktemp("rig")
+    cluster = Rig(FLEET, folder, nodes=VEHICLES, git_of=rig, report=say)
     if rig.existing and cluster.existing == rig.existing:
         pytest.skip(f"E2E_KUBECONFIG_{FLEET.upper()} does not name a second cluster")
-    with running(cluster, request.session):
+    with running(cluster):
         yield cluster
 
 
@@ -83,7 +84,7 @@ def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(world: World, fleet
         for domain in (here, there):
             domain.wake()
         here.wait_lines(expected.after(step, OTHERS))
-    there.kube.wait("the cut to be noticed", lambda: there.trouble("GitRepository", SOURCE) or None)
+    there.kube.wait("the cut", lambda: there.trouble("GitRepository", SOURCE) or None)
     assert there.lines() == expected.after(1, VEHICLES)
     assert there.uids() == pods, "a pod was restarted during the cut"
     fleet.parts.start("git")
@@ -96,7 +97,7 @@ def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(world: World, fleet
     follow(world, last.commit, step)
 
 
-def both(world: World) -> tuple[Domain, Domain]:
+def both(world: World) -> tuple[FluxDomain, FluxDomain]:
     return world.domains[CLUSTER], world.domains[FLEET]
 
 
@@ -112,7 +113,7 @@ def pulls(world: World, fleet: Rig) -> int:
     return fleet.parts.log("git").read_text().count(f'"POST /{world.name}/git-upload-pack ')
 
 
-def applied_since(domain: Domain, commit: str) -> list[str]:
+def applied_since(domain: FluxDomain, commit: str) -> list[str]:
     """Return the commits that the Kustomization has applied since a commit, newest first."""
     history = domain.get("Kustomization", domain.name)["status"]["history"]
     commits = [entry["metadata"]["revision"].rpartition(":")[2] for entry in history]
