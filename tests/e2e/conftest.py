@@ -17,12 +17,11 @@ from demandops_ros import DemandClient
 
 from tests.e2e.common.expected import CLUSTER, NODES
 from tests.e2e.common.intrusion import FILE, NEIGHBOUR, withdraw
-from tests.e2e.common.ros import Client
 from tests.e2e.common.world import DOMAINS, World, running
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Manifest, build_manifest
 from tests.e2e.rig.tools import Report
-from tests.kit.ros import reserved
+from tests.kit.ros import Client, reserved
 
 MakeWorld = Callable[[], World]
 SlipIn = Callable[..., None]
@@ -95,10 +94,15 @@ def client(ros_domain: int) -> Iterator[Client]:
 def make_world(
     rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[MakeWorld]:
-    """Return a function that creates a state repo, which no cluster follows yet."""
+    """Return a function that creates a state repo, which no cluster follows yet.
+
+    It removes the one before: a cluster follows one, and a ROS domain has one generator.
+    """
     made: list[World] = []
 
     def make() -> World:
+        for world in made:
+            world.remove()
         made.append(World(rig, tmp_path_factory.mktemp("world"), ros_domain, client))
         return made[-1]
 

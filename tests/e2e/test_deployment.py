@@ -20,13 +20,13 @@ import yaml
 from tests.e2e.common.expected import demand
 from tests.e2e.common.pod import Pod
 from tests.e2e.common.rendered import check_chart
-from tests.e2e.common.ros import Client
 from tests.e2e.common.world import demandops
 from tests.e2e.rig import githttp
 from tests.e2e.rig.cluster import Rig, git_server
 from tests.e2e.rig.kube import build_manifest
 from tests.e2e.rig.net import free_port, url
 from tests.kit.repo import git
+from tests.kit.ros import Client
 
 pytestmark = pytest.mark.only("flux", "the generator's chart does not depend on the controller")
 
@@ -65,6 +65,10 @@ def test_the_chart_is_refused_without_what_it_needs(rig: Rig, tmp_path: Path, mi
         check_chart(rig, CHART, RELEASE, NAMESPACE, values, tmp_path, lint=False)
 
 
+def leads(pod: Pod) -> bool:
+    return pod.code is None and "taking demands on" in pod.text()
+
+
 class Deployed:
     """The installed chart, with a state repo on a Git server that requires a user and password."""
 
@@ -93,12 +97,8 @@ class Deployed:
         }
         self.install()
         server = yaml.safe_load(rig.kubeconfig.read_text())["clusters"][0]["cluster"]["server"]
-        self.pods = []
-        for name in (f"{RELEASE}-0", f"{RELEASE}-1"):
-            rig.kube.wait(f"pod {name}", lambda name=name: rig.kube.get("Pod", name, NAMESPACE))
-            self.pods.append(
-                Pod(rig.kube, name, NAMESPACE, server.removeprefix("https://"), folder)
-            )
+        address, names = server.removeprefix("https://"), (f"{RELEASE}-0", f"{RELEASE}-1")
+        self.pods = [Pod(rig.kube, name, NAMESPACE, address, folder) for name in names]
         self.start(*self.pods)
 
     def install(self) -> None:
@@ -112,14 +112,13 @@ class Deployed:
         for pod in pods:
             pod.start()
         for pod in pods:
-            self.wait_text(pod, "taking demands on", "standing by")
+            pod.wait_text("taking demands on", "standing by")
 
-    def wait_text(self, pod: Pod, *texts: str) -> None:
-        def told() -> bool:
-            assert pod.code is None, pod.text()
-            return any(text in pod.text() for text in texts)
-
-        self.rig.kube.wait(f"{' or '.join(texts)} in {pod.log}", told)
+    def by_role(self) -> tuple[Pod, Pod]:
+        """Return the leader, which serves the ROS actions, and the pod that stands by."""
+        active, standby = sorted(self.pods, key=leads, reverse=True)
+        assert leads(active) and not leads(standby)
+        return active, standby
 
     def lease_holder(self) -> str:
         lease = self.rig.kube.get("Lease", RELEASE, NAMESPACE)
@@ -144,8 +143,7 @@ class Deployed:
 def deployed(
     rig: Rig, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Deployed]:
-    if rig.existing:
-        pytest.skip("real kubelets start the pods of an existing cluster")
+    assert rig.parts  # else real kubelets start the pods
     if os.geteuid():
         pytest.skip("only root can start a container")
     folder = tmp_path_factory.mktemp("deployed")
@@ -157,23 +155,12 @@ def deployed(
     made.close()
 
 
-@pytest.fixture
-def active(deployed: Deployed) -> Pod:
-    (pod,) = [pod for pod in deployed.pods if _leads(pod)]
-    return pod
-
-
-@pytest.fixture
-def standby(deployed: Deployed, active: Pod) -> Pod:
-    (pod,) = [pod for pod in deployed.pods if pod is not active]
-    return pod
-
-
 def test_one_pod_answers_with_signed_commits(deployed: Deployed, client: Client) -> None:
+    client.ready()
     sent = client.call(demand(1))
     assert sent.status == "succeeded", sent.message
     assert "gpgsig" in git(deployed.repository, "cat-file", "commit", sent.commit)
-    assert sum(_leads(pod) for pod in deployed.pods) == 1
+    deployed.by_role()
     assert len(deployed.lease_holder()) > 36
 
 
@@ -205,26 +192,28 @@ def test_the_account_may_renew_the_lease_and_nothing_else(deployed: Deployed) ->
 
 
 def test_a_killed_pod_is_replaced_and_stands_by_when_it_returns(
-    deployed: Deployed, active: Pod, standby: Pod, client: Client
+    deployed: Deployed, client: Client
 ) -> None:
+    active, standby = deployed.by_role()
     active.kill()
-    deployed.wait_text(standby, "taking demands on")
+    standby.wait_text("taking demands on")
+    client.ready()
     sent = client.call(demand(2))
     assert sent.status == "succeeded", sent.message
     deployed.start(active)
-    assert _leads(standby)
-    assert not _leads(active)
+    assert deployed.by_role() == (standby, active)
 
 
 def test_a_pod_that_returns_hands_in_its_journal_before_it_stands_by(
-    deployed: Deployed, active: Pod, standby: Pod, client: Client
+    deployed: Deployed, client: Client
 ) -> None:
+    active, standby = deployed.by_role()
     before = deployed.subjects()
     deployed.rig.parts.kill(GIT)
     sent = client.send(demand(3))
     client.wait(lambda: "waiting:" in sent.stages)
     active.kill()
-    deployed.wait_text(standby, "taking demands on")
+    standby.wait_text("taking demands on")
     deployed.rig.parts.start(GIT)
     assert deployed.subjects() == before, "the other pod must not have booked the demand"
     slow = deployed.repository / "hooks" / "pre-receive"
@@ -235,17 +224,13 @@ def test_a_pod_that_returns_hands_in_its_journal_before_it_stands_by(
     slow.unlink()
     assert deployed.subjects() != before
     assert "resuming demand" in active.text()
-    assert not _leads(active)
+    assert deployed.by_role() == (standby, active)
 
 
-def test_an_upgrade_leaves_the_lease_to_its_holder(deployed: Deployed, active: Pod) -> None:
+def test_an_upgrade_leaves_the_lease_to_its_holder(deployed: Deployed) -> None:
+    active, _ = deployed.by_role()
     holder = deployed.lease_holder()
     deployed.values |= {"fetchInterval": "10s"}
     deployed.install()
     assert deployed.lease_holder() == holder
     assert active.code is None
-
-
-def _leads(pod: Pod) -> bool:
-    """Return whether a pod is the leader, which serves the ROS actions."""
-    return pod.code is None and "taking demands on" in pod.text()

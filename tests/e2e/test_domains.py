@@ -251,8 +251,7 @@ def test_the_hosts_network_is_refused_once_the_policy_forbids_it(world: World) -
     domain.kube.wait("the refusal", lambda: all(why in domain.kube.refusal(one) for one in others))
     assert "violates PodSecurity" in domain.kube.refusal(alone)
     assert [domain.kube.refusal(one) for one in makers(pod())] == [""] * (len(others) + 1)
-    domain.wake()
-    domain.wait_applied(sent.commit)
+    domain.follow(sent.commit)
     domain.wait_releases()
     for deployment in domain.find("Deployment"):
         assert "hostNetwork" not in deployment["spec"]["template"]["spec"]

@@ -11,11 +11,11 @@ from tests.e2e.common.argocd import ArgoDomain
 from tests.e2e.common.domain import name_of
 from tests.e2e.common.expected import CLUSTER, NODES
 from tests.e2e.common.flux import FluxDomain
-from tests.e2e.common.ros import Client
 from tests.e2e.common.world import World, running
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.components import ARGOCD as CONTROL
 from tests.e2e.rig.tools import Report
+from tests.kit.ros import Client
 
 SUSPENDED = {"spec": {"suspend": True}}
 

@@ -14,8 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.rig import githttp, net, settings, tools
-from tests.e2e.rig.errors import RigError
+from tests.e2e.rig import RigError, githttp, net, settings, tools
 from tests.e2e.rig.kube import Kube
 from tests.e2e.rig.processes import Component, Processes
 from tests.kit.generator import wait_until
@@ -80,7 +79,7 @@ def test_a_killed_build_leaves_nothing_that_looks_done(
 ) -> None:
     monkeypatch.setenv("FAKE_GO_SECONDS", "300")
     with killed("from tests.e2e.rig import tools; tools.ensure(['etcd'])"):
-        wait_until(lambda: [*tools.cache_root().glob(".building-*/etcd")], "a build")
+        wait_until(lambda: [*tools.cache_root().glob(".building-*/etcd/etcd")], "a build")
     assert list(tools.cache_root().glob("etcd-*")) == []
     monkeypatch.setenv("FAKE_GO_SECONDS", "0")
     assert tools.ensure(["etcd"])["etcd"].read_text() == "whole"

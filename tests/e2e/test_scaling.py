@@ -6,7 +6,6 @@ import re
 
 from tests.e2e.common import expected
 from tests.e2e.common.expected import CLUSTER, DETECTION, FUSION
-from tests.e2e.common.hands import change_image, pod_template
 from tests.e2e.common.rendered import raised
 from tests.e2e.common.world import World
 from tests.kit.config import override
@@ -38,17 +37,16 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
         """Push files, demand step 1, and wait until the newest commit is applied."""
         world.push(files)
         world.demand(expected.demand(1))
-        domain.wake()
-        domain.wait_applied(world.tip())
+        domain.follow(world.tip())
 
     def scale_and_change_image(to: int, *names: str) -> None:
         """Scale as an autoscaler does, change the images, and wait until these are restored."""
         for each in names:
-            template = pod_template(domain, each)
+            template = domain.pod_template(each)
             domain.kube.scale(each, to, domain.namespace)
-            change_image(domain, each)
+            domain.change_image(each)
             domain.restore(each)
-            domain.kube.wait("the image", lambda e=each, t=template: pod_template(domain, e) == t)
+            domain.kube.wait("the image", lambda e=each, t=template: domain.pod_template(e) == t)
 
     original = world.file(APPDEF)
     merge(_autoscaled(world))
@@ -60,9 +58,9 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
     scale_and_change_image(3, name, FUSION)
     assert (replicas(), replicas(FUSION)) == (3, 3)
 
-    template = pod_template(domain, name)
+    template = domain.pod_template(name)
     merge({MANY: override(SCALED, values={"podLabels": {"team": "perception"}})})
-    domain.kube.wait("an upgrade", lambda: pod_template(domain, name) != template)
+    domain.kube.wait("an upgrade", lambda: domain.pod_template(name) != template)
     domain.wait_releases()
     assert replicas() == 3
     merge({MANY: override(SCALED, replicas=4)})

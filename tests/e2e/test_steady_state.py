@@ -16,7 +16,6 @@ from tests.e2e.common.expected import (
     target_end,
     unscheduled,
 )
-from tests.e2e.common.hands import change_image, overwrite, pod_template, wait_restored
 from tests.e2e.common.rendered import raised
 from tests.e2e.common.world import World
 
@@ -32,8 +31,7 @@ def test_a_service_that_cannot_start_is_reconfigured_and_removed(
         world.step(step, unscheduled(expected.after(step)))
     for step in (1, 2, 3):
         sent = world.demand(expected.demand(step) | {"shutdown": True})
-    domain.wake()
-    domain.wait_applied(sent.commit)
+    domain.follow(sent.commit)
     domain.wait_lines(WITHOUT_DEMANDS)
 
 
@@ -72,11 +70,20 @@ def test_another_requester_changes_no_object_of_a_release(world: World, domain: 
     assert domain.releases() == releases
 
 
+def wait_restored(
+    domain: Domain, template: dict[str, Any], data: dict[str, str], *names: str
+) -> None:
+    """Wait until a Deployment and a ConfigMap, of these names, are as they were."""
+    deployment, config = names
+    domain.wait("the image", lambda: domain.pod_template(deployment) == template)
+    domain.wait("the content", lambda: domain.get("ConfigMap", config)["data"] == data)
+
+
 def test_deleted_and_changed_objects_of_a_release_are_restored(domain: Domain) -> None:
     detection, params = DETECTION["vehicle00"], f"{FUSION}-params"
-    template, inputs = pod_template(domain, detection), domain.get("ConfigMap", params)["data"]
-    change_image(domain, detection)
-    overwrite(domain, params, "params.yml")
+    template, inputs = domain.pod_template(detection), domain.get("ConfigMap", params)["data"]
+    domain.change_image(detection)
+    domain.overwrite(params, "params.yml")
     domain.restore(detection, FUSION)
     wait_restored(domain, template, inputs, detection, params)
 
@@ -88,9 +95,9 @@ def test_deleted_and_changed_objects_of_a_release_are_restored(domain: Domain) -
 
 
 def test_plain_manifests_and_releases_are_restored(domain: Domain) -> None:
-    template, topics = pod_template(domain, PLAIN), domain.get("ConfigMap", PLAIN)["data"]
-    change_image(domain, PLAIN)
-    overwrite(domain, PLAIN, "params.yaml")
+    template, topics = domain.pod_template(PLAIN), domain.get("ConfigMap", PLAIN)["data"]
+    domain.change_image(PLAIN)
+    domain.overwrite(PLAIN, "params.yaml")
     gone = [("Deployment", OTHER), ("ConfigMap", OTHER), (domain.RELEASE, DETECTION["station00"])]
     for kind, name in gone:
         domain.take_away(kind, name)

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from tests.e2e.common import expected
-from tests.e2e.common.domain import Domain
-from tests.e2e.common.expected import CLUSTER
+from tests.e2e.common.expected import CLUSTER, NAMESPACE
 from tests.e2e.common.world import World
 from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Gitops, Rig
-from tests.kit.repo import first_version, git
+from tests.kit.repo import git
 
 SECOND = Path(__file__).parents[1] / "fixtures" / "second-version" / "state.bundle"
 RECORDER = "rec-edge-recorder-62dc17457446"
@@ -23,7 +21,6 @@ OTHER: dict[Gitops, tuple[Gitops, str]] = {
     "flux": ("argocd", "Application"),
     "argocd": ("flux", "HelmRelease"),
 }
-OF_FLUX = "the former versions render for Flux alone"
 
 
 def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(
@@ -48,75 +45,33 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(
     assert domain.uids() == before
     assert domain.releases() == releases
 
-    world.upgrade(gitops)
-    domain.wake()
-    domain.wait_applied(world.tip())
+    domain.follow(world.upgrade(gitops))
     assert domain.uids() == before
     for step in (2, 3):
         world.step(step, expected.after(step))
 
 
-def follow_former(world: World, rig: Rig, source: Path, revision: str) -> Domain:
-    """Publish what a former version left, and let the cluster run it."""
-    former = f"{revision}^{{commit}}:refs/heads/main"
-    git(source, "push", "--quiet", "--force", world.push_url, former)
-    manifests = world.manifests(CLUSTER)
-    for item in manifests:
-        if item["kind"] == "GitRepository":
-            item["spec"]["url"] = rig.git_url(world.name)
-    domain: Any
-    for domain in world.lay_down(rig, manifests):
-        world.domains[domain.namespace] = domain
-    domain = world.domains[expected.NAMESPACE]
-    domain.settle(world.tip())
-    domain.wait_releases()
-    return domain
-
-
-def upgrade(world: World, domain: Domain) -> None:
-    world.upgrade()
-    domain.wake()
-    domain.wait_applied(world.tip())
-    domain.wait_releases()
-
-
-@pytest.mark.only("flux", OF_FLUX)
-def test_an_upgrade_from_the_first_version_restarts_the_fusion_alone(
-    make_world: MakeWorld, rig: Rig, tmp_path: Path
-) -> None:
-    world = make_world()
-    domain = follow_former(world, rig, first_version(tmp_path / "first.git").path, "three-joins")
-    domain.wait_lines(expected.after(3))
-    before = domain.uids()
-    assert before
-
-    upgrade(world, domain)
-    after = domain.uids()
-    assert after.keys() == before.keys()
-    assert {name for name in before if after[name] != before[name]} == {expected.FUSION}
-    (fusion,) = domain.find("HelmRelease", expected.FUSION)
-    assert fusion["metadata"]["labels"]["app.kubernetes.io/part-of"] == "object-detection-fusion"
-    world.domains.clear()
-    domain = world.bootstrap(CLUSTER, rig, url=rig.git_url(world.name))  # the upgrade requires it
-    assert domain.uids() == after
-
-    world.generator.start()
-    world.step(4, expected.after(4))
-    world.step(5, expected.after(5))
-    world.remove()
-
-
-@pytest.mark.only("flux", OF_FLUX)
+@pytest.mark.only("flux", "the second version's state repo is for Flux")
 def test_an_upgrade_from_the_second_version_restarts_nothing_that_stays(
     make_world: MakeWorld, rig: Rig, tmp_path: Path
 ) -> None:
     world = make_world()
     git(tmp_path, "clone", "--quiet", "--bare", str(SECOND), "second.git")
-    domain = follow_former(world, rig, tmp_path / "second.git", "before-faults")
+    left = "before-faults^{commit}:refs/heads/main"
+    git(tmp_path / "second.git", "push", "--quiet", "--force", world.push_url, left)
+    manifests = world.manifests(CLUSTER)
+    for item in manifests:
+        if item["kind"] == "GitRepository":
+            item["spec"]["url"] = rig.git_url(world.name)
+    world.domains = {domain.namespace: domain for domain in world.lay_down(rig, manifests)}
+    domain = world.domains[NAMESPACE]
+    domain.settle(world.tip())
+    domain.wait_releases()
     before = domain.uids()
     assert [name for name in before if name.startswith(TWICE)]
 
-    upgrade(world, domain)
+    domain.follow(world.upgrade())
+    domain.wait_releases()
     after = domain.uids()
     assert after.keys() == {name for name in before if not name.startswith(TWICE)}
     # one service had kept replicas that nobody demands: it has fewer pods now, or soon

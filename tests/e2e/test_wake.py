@@ -14,11 +14,10 @@ from tests.e2e.common.access import access_file, documented_roles, limited, limi
 from tests.e2e.common.expected import CLUSTER, STEPS, WITHOUT_DEMANDS
 from tests.e2e.common.goals import application
 from tests.e2e.common.rendered import DETECTION_TEMPLATE, raised
-from tests.e2e.common.world import World, show_times
+from tests.e2e.common.world import World
 from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.components import ARGOCD_SERVER, WEBHOOK_SECRET
-from tests.e2e.rig.tools import Report
 
 ROUNDS = 3
 """How often the paper's eight demands are sent, one right after the other."""
@@ -31,15 +30,12 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
     return limited_world(make_world(), rig, interval="10m")
 
 
-def test_a_trigger_saves_the_wait_for_the_next_fetch(world: World, say: Report) -> None:
-    times = {"joins": world.step(1, expected.after(1), wake=False)}
-    show_times(say, "Triggered by the generator, next fetch after 10 minutes", times)
-    sent = world.demand(expected.demand(1) | {"shutdown": True})
-    world.follow(sent, WITHOUT_DEMANDS, wake=False)
-
-
-def test_a_burst_of_demands_leaves_nothing(world: World) -> None:
+def test_a_demand_does_not_wait_for_the_next_fetch_and_a_burst_of_demands_leaves_nothing(
+    world: World,
+) -> None:
     """A busy Flux could forget an object that it is just creating, and then never remove it."""
+    world.demand(expected.demand(1))
+    world.domain.wait_lines(expected.after(1))
     for step in (*STEPS,) * ROUNDS:
         sent = world.demand(expected.demand(step))
     world.domain.wait_applied(sent.commit)
@@ -49,8 +45,7 @@ def test_a_burst_of_demands_leaves_nothing(world: World) -> None:
 @pytest.fixture
 def webhook(world: World, rig: Rig) -> World:
     """Let the generator call Argo CD's webhook, with the right to read the cluster alone."""
-    if rig.existing:
-        pytest.skip("the tests do not know the webhook secret of an existing Argo CD")
+    url = rig.parts.url(ARGOCD_SERVER)
     world.generator.stop()
     secret = world.folder / "secret"
     secret.touch(mode=0o600)
@@ -63,7 +58,7 @@ def webhook(world: World, rig: Rig) -> World:
     }
     access = {
         "kubeconfig": limited(rig.kube, rig.kubeconfig, world.folder, rights),
-        "webhook": f"{rig.parts.url(ARGOCD_SERVER)}/api/webhook",
+        "webhook": f"{url}/api/webhook",
         "secret_file": secret,
     }
     file = access_file(world.folder, {CLUSTER: access})
@@ -113,8 +108,6 @@ def test_the_webhook_refreshes_what_a_push_changed_and_a_chart_edited_in_its_fol
 def test_a_call_with_another_signature_or_none_is_refused(
     world: World, rig: Rig, secret: bytes | None
 ) -> None:
-    if rig.existing:
-        pytest.skip("the tests do not know the webhook secret of an existing Argo CD")
     url = f"{rig.parts.url(ARGOCD_SERVER)}/api/webhook"
     pushed = (rig.git_url(world.name), "", world.tip(), None)
     with pytest.raises(NoAnswer, match=r"^it answered 400$"):

@@ -17,13 +17,12 @@ from typing import Any
 from examples.experiment import paper
 from tests.e2e.common.access import limited_world
 from tests.e2e.common.expected import CLUSTER
-from tests.e2e.common.ros import Client
 from tests.e2e.common.world import World, demandops, environment
 from tests.e2e.rig import launch
 from tests.e2e.rig.cluster import Rig
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import git
-from tests.kit.ros import reserved
+from tests.kit.ros import Client, reserved
 
 from . import fleet, routes
 from .broker import Broker

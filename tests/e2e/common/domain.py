@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import re
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import yaml
 
-from tests.e2e.rig.errors import RigError
+from tests.e2e.rig import RigError
 from tests.e2e.rig.kube import Kube, Manifest
 
 from .expected import FUSION
@@ -39,63 +38,28 @@ The name has no hash, except for a client of a derived connection, whose topic m
 """
 
 
-class Domain(ABC):
+class Domain:
     """An access domain's namespace; the object `name` of the kind `FOLDER` applies its folder."""
 
+    # What each controller says of itself.
     RELEASE: ClassVar[str]  # the kind of a release
     FOLDER: ClassVar[str]
     OWN: ClassVar[tuple[str, ...]] = ()  # further kinds of the controller's objects
     STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that a commit must not touch without need
-    # What a test can kill: what fetches commits, applies the folder, and installs a release.
+    # its programs: what fetches commits, applies the folder, and installs a release
     FETCHER: ClassVar[str]
     APPLIER: ClassVar[str]
     INSTALLER: ClassVar[str]
-
-    def __init__(self, kube: Kube, namespace: str, name: str) -> None:
-        self.kube, self.namespace, self.name = kube, namespace, name
-
-    # --- what each controller answers -------------------------------------------------------
-
-    @classmethod
-    @abstractmethod
-    def all_in(cls, kube: Kube, bootstrap: list[Manifest]) -> list[Domain]:
-        """Return the domains that a bootstrap file lays down."""
-
-    @abstractmethod
-    def settle(self, commit: str) -> None:
-        """Wait until the bootstrap file and a commit are applied."""
-
-    @abstractmethod
-    def remove(self) -> None:
-        """Remove the controller's objects, with all releases."""
-
-    @abstractmethod
-    def wake(self) -> None:
-        """Make the controller fetch from the remote now."""
-
-    @abstractmethod
-    def fetched(self) -> str:
-        """Return the commit that was fetched last; empty if none."""
-
-    @abstractmethod
-    def applied(self) -> str:
-        """Return the commit that the folder is in sync with; empty if none."""
-
-    @abstractmethod
-    def trouble(self, kind: str, name: str) -> str:
-        """Return why an object of the controller is not ready; empty if it is."""
-
-    @abstractmethod
-    def wait_attempted(self, commit: str) -> None:
-        """Wait until a commit is applied or refused."""
-
-    @abstractmethod
-    def wait_checked(self, commit: str) -> None:
-        """Wait until every release was compared with a commit."""
-
-    @abstractmethod
-    def wait_releases(self) -> None:
-        """Wait until all releases are applied; their pods need not be ready."""
+    all_in: ClassVar[Callable[..., list[Any]]]  # the domains that a bootstrap file lays down
+    settle: Callable[[str], None]  # wait until the bootstrap file and a commit are applied
+    remove: Callable[[], None]  # the controller's objects, with all releases
+    wake: Callable[[], None]  # make the controller fetch from the remote now
+    fetched: Callable[[], str]  # the commit that was fetched last; empty if none
+    applied: Callable[[], str]  # the commit that the folder is in sync with; empty if none
+    trouble: Callable[[str, str], str]  # why an object (kind, name) is not ready, or nothing
+    wait_attempted: Callable[[str], None]  # until a commit is applied or refused
+    wait_checked: Callable[[str], None]  # until every release was compared with a commit
+    wait_releases: Callable[[], None]  # until all are applied; their pods need not be ready
 
     def read_chart(self, release: str) -> None:
         """Make the controller read a release's chart again, if it does not do so by itself."""
@@ -105,6 +69,9 @@ class Domain(ABC):
 
     def restore(self, *releases: str) -> None:
         """Make the controller restore these releases, or without any the folder, if it must."""
+
+    def __init__(self, kube: Kube, namespace: str, name: str) -> None:
+        self.kube, self.namespace, self.name = kube, namespace, name
 
     # --- reading ----------------------------------------------------------------------------
 
@@ -164,29 +131,71 @@ class Domain(ABC):
             for item in self.find("Deployment")
         }
 
-    # --- waiting; the times are those of `time.monotonic` -------------------------------------
+    def pod_template(self, deployment: str) -> dict[str, Any]:
+        return dict(self.get("Deployment", deployment)["spec"]["template"])
 
-    def wait_fetched(self, commit: str) -> float:
-        return self.wait(f"{commit[:10]} to be fetched", lambda: self.fetched() == commit)
+    # --- what a person may change by hand -----------------------------------------------------
 
-    def wait_applied(self, commit: str) -> float:
-        return self.wait(f"{commit[:10]} to be applied", lambda: self.applied() == commit)
+    def change_image(self, deployment: str) -> None:
+        containers = self.pod_template(deployment)["spec"]["containers"]
+        containers[0]["image"] = "example.invalid/other:1"
+        body = {"spec": {"template": {"spec": {"containers": containers}}}}
+        self.kube.patch("Deployment", deployment, body, self.namespace)
 
-    def wait_lines(self, wanted: frozenset[str]) -> float:
+    def overwrite(self, config: str, key: str) -> None:
+        self.kube.patch("ConfigMap", config, {"data": {key: "by hand"}}, self.namespace)
+
+    # --- waiting ----------------------------------------------------------------------------
+
+    def wait_fetched(self, commit: str) -> None:
+        self.wait(f"{commit[:10]} to be fetched", lambda: self.fetched() == commit)
+
+    def wait_applied(self, commit: str) -> None:
+        self.wait(f"{commit[:10]} to be applied", lambda: self.applied() == commit)
+
+    def follow(self, commit: str) -> None:
+        """Wake the controller, and wait until it has applied a commit."""
+        self.wake()
+        self.wait_applied(commit)
+
+    def wait(self, what: str, look: Callable[[], bool]) -> None:
+        """Wait for something that the controller does; on failure say what troubles it."""
+        try:
+            self.kube.wait(what, look)
+        except RigError as error:
+            raise AssertionError(
+                f"{error}; {'; '.join(self._troubles(*self.releases()))}"
+            ) from error
+
+    def wait_refused(self, why: str, *releases: str) -> None:
+        """Wait until the domain's folder, or one of these releases, reports a refusal."""
+        self.kube.wait(f"'{why}'", lambda: any(why in told for told in self._troubles(*releases)))
+
+    def _troubles(self, *releases: str) -> list[str]:
+        kinds = {self.name: self.FOLDER} | dict.fromkeys(releases, self.RELEASE)
+        return [told for name, kind in kinds.items() if (told := self.trouble(kind, name))]
+
+    def wait_lines(self, wanted: frozenset[str]) -> None:
         """Wait until `lines` returns just the wanted lines."""
-        return self._wait_same(self.lines, wanted)
+        self._wait_same(self.lines, wanted)
 
     def wait_inventory(self, wanted: frozenset[str]) -> None:
         self._wait_same(self.inventory, wanted)
 
-    def wait_refused(self, why: str, *releases: str) -> None:
-        """Wait until the domain's folder, or one of these releases, reports a refusal."""
-        kinds = {self.name: self.FOLDER} | dict.fromkeys(releases, self.RELEASE)
+    def _wait_same(self, look: Callable[[], frozenset[str]], wanted: frozenset[str]) -> None:
+        seen: frozenset[str] = frozenset()
 
-        def refused() -> bool:
-            return any(why in self.trouble(kind, name) for name, kind in kinds.items())
+        def same() -> bool:
+            nonlocal seen
+            seen = look()
+            return seen == wanted
 
-        self.kube.wait(f"'{why}' to be reported", refused)
+        try:
+            self.kube.wait("exactly what is wanted", same)
+        except RigError as error:
+            lines = [f"  missing: {line}" for line in sorted(wanted - seen)]
+            lines += [f"  too much: {line}" for line in sorted(seen - wanted)]
+            raise AssertionError("\n".join([str(error), *lines])) from error
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
         """Wait until no release has changed for ``seconds``, nor its status.
@@ -210,18 +219,6 @@ class Domain(ABC):
         self.kube.wait("the releases to stop changing", quiet)
         return seen
 
-    def wait(self, what: str, look: Callable[[], bool]) -> float:
-        """Wait for something that the controller does; on failure say what troubles it."""
-        try:
-            self.kube.wait(what, look)
-        except RigError as error:
-            kinds = {self.name: self.FOLDER} | dict.fromkeys(self.releases(), self.RELEASE)
-            told = [self.trouble(kind, name) for name, kind in kinds.items()]
-            raise AssertionError(f"{error}; {'; '.join(filter(None, told))}") from error
-        return time.monotonic()
-
-    # --- inside -----------------------------------------------------------------------------
-
     def _all_counted(self) -> bool:
         return all(
             status.get("observedGeneration") == item["metadata"]["generation"]
@@ -231,22 +228,6 @@ class Domain(ABC):
             for status in (item.get("status", {}),)
             for counted in ("readyReplicas", "availableReplicas")
         )
-
-    def _wait_same(self, look: Callable[[], frozenset[str]], wanted: frozenset[str]) -> float:
-        seen: frozenset[str] = frozenset()
-
-        def same() -> bool:
-            nonlocal seen
-            seen = look()
-            return seen == wanted
-
-        try:
-            self.kube.wait("exactly what is wanted", same)
-        except RigError as error:
-            lines = [f"  missing: {line}" for line in sorted(wanted - seen)]
-            lines += [f"  too much: {line}" for line in sorted(seen - wanted)]
-            raise AssertionError("\n".join([str(error), *lines])) from error
-        return time.monotonic()
 
     def _status(self, kind: str, name: str) -> dict[str, Any]:
         found = self.kube.get(kind, name, self.namespace) or {}

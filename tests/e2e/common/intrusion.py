@@ -67,5 +67,4 @@ def withdraw(world: World) -> None:
     commit = world.tip()
     if left := world.git("ls-files", FILE, BASE, ELSEWHERE).split():
         commit = world.push(dict.fromkeys(left))
-    world.domain.wake()
-    world.domain.wait_applied(commit)
+    world.domain.follow(commit)

@@ -12,7 +12,6 @@ import sys
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +19,15 @@ import yaml
 
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Kube, Manifest
-from tests.e2e.rig.tools import Report
 from tests.kit.repo import Person, git
-from tests.kit.ros import Sent, Served, Servers
+from tests.kit.ros import Client, Sent, Served, Servers
 
 from .argocd import ArgoDomain
 from .domain import Domain
 from .expected import CLUSTER, NAMESPACE, WITHOUT_DEMANDS, demand
 from .flux import FluxDomain
-from .ros import Client
 
 DOMAINS: dict[Gitops, type[Domain]] = {"flux": FluxDomain, "argocd": ArgoDomain}
-STAGES = ("committed", "pushed", "fetched", "applied", "ready")
 
 
 class Generator:
@@ -44,7 +40,7 @@ class Generator:
         """Start the generator; wait until it accepts goals."""
         self._served = self._servers.start(self._state_repo, *arguments)
         self._served.wait_for("taking demands on")
-        self._client.wait(self._client.reaches_a_node)
+        self._client.ready()
 
     def kill(self) -> None:
         self._servers.kill()
@@ -163,39 +159,19 @@ class World:
 
     def demand(self, goal: dict[str, Any]) -> Sent:
         """Send a goal, check that it succeeds, and return it with its answer."""
+        self.client.ready()
         sent = self.client.call(goal)
         assert sent.status == "succeeded", sent.message
         return sent
 
-    def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> list[float]:
-        """Send the goal of a step, then `follow` the goal."""
-        return self.follow(self.demand(demand(number)), wanted, wake=wake)
+    def step(self, number: int, wanted: frozenset[str]) -> None:
+        """Send the goal of a step, and `follow` it."""
+        self.follow(self.demand(demand(number)), wanted)
 
-    def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> list[float]:
-        """Wait until the cluster has applied a goal's commit, and its `lines` are as wanted.
-
-        Return when the goal was sent, and when it reached each of :data:`STAGES`. With `wake`,
-        trigger the controller first.
-        """
-        domain = self.domain
-        if wake:
-            domain.wake()
-        fetched = domain.wait_fetched(sent.commit)
-        applied = domain.wait_applied(sent.commit)
-        ready = domain.wait_lines(wanted)
-        pushed = sent.stages["pushed"]
-        committed = sent.stages.get("committed", pushed)  # no commit if nothing changed
-        return [sent.at, committed, pushed, fetched, applied, ready]
-
-
-def show_times(say: Report, heading: str, rows: Mapping[str, list[float]]) -> None:
-    """Print how long each demand took to each stage; `rows` has results of :meth:`World.follow`."""
-    width = max(map(len, rows))
-    say(f"\n{heading} (seconds)")
-    say(" " * (width + 2) + "".join(f"{stage:>11}" for stage in (*STAGES, "in all")))
-    for title, at in rows.items():
-        taken = [*(after - before for before, after in pairwise(at)), at[-1] - at[0]]
-        say(f"  {title:<{width}}" + "".join(f"{value:11.2f}" for value in taken))
+    def follow(self, sent: Sent, wanted: frozenset[str]) -> None:
+        """Wait until the cluster has applied a goal's commit, and its `lines` are as wanted."""
+        self.domain.follow(sent.commit)
+        self.domain.wait_lines(wanted)
 
 
 @contextmanager

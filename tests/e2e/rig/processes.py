@@ -18,8 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from . import launch
-from .errors import RigError
+from . import RigError, launch
 from .net import Probe
 
 _POLL_SECONDS = 0.05

@@ -28,13 +28,15 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from . import launch
-from .errors import RigError
+from . import RigError, launch
 
 WRAPPERS = Path(__file__).resolve().parent.parent / "tools"
 CACHE_VARIABLE = "DEMANDOPS_E2E_CACHE"
+_BUILDING = ".building-"
 
 Report = Callable[[str], None]
 
@@ -84,20 +86,21 @@ TOOLS = {
 
 def ensure(names: Iterable[str], report: Report | None = None) -> dict[str, Path]:
     """Return the paths of these programs, after building what the cache lacks; raise RigError."""
-    wanted, say = list(names), report or _to_stderr
+    wanted, say = [TOOLS[name] for name in names], report or _to_stderr
     if shutil.which("go") is None:
         raise RigError("tests/e2e/tools: `go` is not on PATH: `make go` installs it into build/")
-    go = _go(Path("/"), {}, "env", "GOVERSION", "GOOS", "GOARCH").splitlines()
-    entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], *go)}" for name in wanted}
-    missing = [name for name in wanted if not entries[name].is_dir()]
-    for place, name in enumerate(missing, start=1):
+    version, *target = _go(Path("/"), {}, "env", "GOVERSION", "GOOS", "GOARCH").splitlines()
+    entries = {
+        tool: cache_root() / f"{tool.name}-{_digest(tool, version, target)}" for tool in wanted
+    }
+    if not all(entry.is_dir() for entry in entries.values()):
         with _turn(cache_root(), say):
-            if not entries[name].is_dir():  # another run may have built it while we waited
-                say(f"building program {place} of {len(missing)}, {name}")
-                _build(TOOLS[name], entries[name], say)
-                if TOOLS[name].wrapper not in [TOOLS[other].wrapper for other in missing[place:]]:
-                    shutil.rmtree(_workspace(TOOLS[name]), ignore_errors=True)
-    return {name: entries[name] / name for name in wanted}
+            # another run may have built some while we waited
+            missing = [tool for tool in wanted if not entries[tool].is_dir()]
+            for wrapper, tools in groupby(missing, lambda tool: tool.wrapper):
+                with TemporaryDirectory(prefix=_BUILDING, dir=cache_root()) as workspace:
+                    _build(Path(workspace), WRAPPERS / wrapper, {t: entries[t] for t in tools}, say)
+    return {tool.name: entry / tool.name for tool, entry in entries.items()}
 
 
 def needed_with(*gitops: str) -> list[str]:
@@ -116,23 +119,13 @@ def cache_root() -> Path:
     return Path(named).expanduser().resolve()
 
 
-def _workspace(tool: Tool) -> Path:
-    """Return the folder of a wrapper's builds, with its sources and compiled packages.
-
-    The modules of all wrappers and their compiled packages would fill about 15 GB. So a workspace
-    keeps only the sources that its wrapper builds, in a vendor folder, and is removed after the
-    wrapper's last build.
-    """
-    return cache_root() / f".go-{tool.wrapper}"
-
-
-def _digest(tool: Tool, version: str, system: str, machine: str) -> str:
+def _digest(tool: Tool, version: str, target: list[str]) -> str:
     """Return a digest of what decides a program's bytes: pins, flags, toolchain and target."""
-    folder, target = WRAPPERS / tool.wrapper, f"{system}/{machine}"
+    folder, built = WRAPPERS / tool.wrapper, [version, "/".join(target)]
     parts = [
         (folder / "go.mod").read_bytes(),
         (folder / "go.sum").read_bytes(),
-        json.dumps([tool.package, tool.crds_of, _flags(tool), version, target]).encode(),
+        json.dumps([tool.package, tool.crds_of, _flags(tool), *built]).encode(),
     ]
     joined = b"\0".join(hashlib.sha256(part).digest() for part in parts)
     return hashlib.sha256(joined).hexdigest()[:16]
@@ -163,56 +156,48 @@ def _turn(root: Path, say: Report) -> Iterator[None]:
         except BlockingIOError:
             say(f"another run is building into {root}, waiting for it")
             fcntl.flock(lock, fcntl.LOCK_EX)
-        for leftover in root.glob(".building-*"):  # only of killed builds, as we hold the lock
+        for leftover in root.glob(f"{_BUILDING}*"):  # only of killed builds, as we hold the lock
             shutil.rmtree(leftover, ignore_errors=True)
         yield
 
 
-def _build(tool: Tool, entry: Path, say: Report) -> None:
-    workspace, staging = _workspace(tool), entry.parent / f".building-{entry.name}"
-    module, start = workspace / "wrapper", time.monotonic()
-    own = {"GOMODCACHE": workspace / "modules", "GOCACHE": workspace / "compiled"}
+def _build(workspace: Path, wrapper: Path, entries: dict[Tool, Path], say: Report) -> None:
+    """Build programs of one wrapper in a folder that goes afterwards.
+
+    The modules of all wrappers and their compiled packages would fill about 15 GB. So a workspace
+    has only the sources that its wrapper builds, in a vendor folder.
+    """
+    module, own = workspace / "wrapper", {"GOCACHE": "compiled", "GOMODCACHE": "modules"}
+    own = {name: str(workspace / folder) for name, folder in own.items()}
 
     def go(*arguments: str) -> str:
-        return _go(module, own | {"GOTMPDIR": workspace}, *arguments)
+        return _go(module, own | {"GOTMPDIR": str(workspace)}, *arguments)
 
-    staging.mkdir()
-    try:
-        say("fetching modules")
-        if not _is_vendored(module, WRAPPERS / tool.wrapper):
-            # a killed run may have left a folder with other versions
-            shutil.rmtree(workspace, ignore_errors=True)
-            shutil.copytree(WRAPPERS / tool.wrapper, module)
-            go("mod", "vendor", "-o", "fetched")  # this compares the sources with `go.sum`
-            (module / "fetched").rename(module / "vendor")
+    say(f"fetching modules for {', '.join(tool.name for tool in entries)}")
+    shutil.copytree(wrapper, module)
+    go("mod", "vendor", "-o", "fetched")  # this compares the sources with `go.sum`
+    (module / "fetched").rename(module / "vendor")
+    for tool in entries:
+        (workspace / tool.name).mkdir()
         if tool.crds_of:
-            # it fetches them again if an earlier build was interrupted after it had dropped them
             unpacked = json.loads(go("mod", "download", "-json", tool.crds_of))
-            _copy_crds(Path(unpacked["Dir"]), staging / "crds")
-        shutil.rmtree(workspace / "modules", ignore_errors=True)
-
-        flags = ["-mod=vendor", *_flags(tool)]
+            _copy_crds(Path(unpacked["Dir"]), workspace / tool.name / "crds")
+    shutil.rmtree(workspace / "modules", ignore_errors=True)
+    for tool, entry in entries.items():
+        start, flags = time.monotonic(), ["-mod=vendor", *_flags(tool)]
         packages = go("list", *flags, "-deps", tool.package).split()
         # Go keeps a second copy of what a command compiles until the command ends. So each command
         # compiles only a part. Dependencies come before their users, so this costs no time.
         others = [one for one in packages if "." in one.partition("/")[0] and one != tool.package]
         for first in range(0, len(others), _PACKAGES_AT_ONCE):
-            say(f"compiling, {first} of {len(others)} packages done")
+            say(f"compiling {tool.name}, {first} of {len(others)} packages done")
             go("build", *flags, *others[first : first + _PACKAGES_AT_ONCE])
-        binary = staging / tool.name
+        binary = workspace / tool.name / tool.name
         go("build", *flags, "-o", str(binary), tool.package)
         with binary.open("rb") as written:
             os.fsync(written.fileno())  # otherwise a power cut could leave an empty file
-        staging.rename(entry)
+        binary.parent.rename(entry)
         say(f"built in {time.monotonic() - start:.0f} s")
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
-
-
-def _is_vendored(module: Path, wrapper: Path) -> bool:
-    pins = [folder / name for folder in (module, wrapper) for name in ("go.mod", "go.sum")]
-    texts = [path.read_bytes() if path.exists() else b"" for path in pins]
-    return (module / "vendor").is_dir() and texts[:2] == texts[2:]
 
 
 def _copy_crds(module: Path, target: Path) -> None:
@@ -225,7 +210,7 @@ def _copy_crds(module: Path, target: Path) -> None:
         (target / source.name).write_bytes(source.read_bytes())  # copies no read-only mode
 
 
-def _go(folder: Path, own: dict[str, Path], *arguments: str) -> str:
+def _go(folder: Path, own: dict[str, str], *arguments: str) -> str:
     # The linker strips debug information. Without it the compiler needs a third less disk space.
     flags = "-mod=readonly -modcacherw -gcflags=all=-dwarf=false"
     settings = {"GOTOOLCHAIN": "local", "GOWORK": "off", "CGO_ENABLED": "0", "GOFLAGS": flags}
@@ -235,7 +220,7 @@ def _go(folder: Path, own: dict[str, Path], *arguments: str) -> str:
     done = subprocess.run(
         launch.command(shutil.which("go") or "go", *arguments, niceness=19),
         cwd=folder,
-        env=kept | settings | {key: str(path) for key, path in own.items()},
+        env=kept | settings | own,
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
