@@ -38,7 +38,7 @@ OF_THE_ROOT = {
     "examples/lane-detection/appdefs/lane-detection/charts/ros-launch/README.md": (
         "project/ros-launch.md"
     ),
-    "tests/experiment/README.md": "project/experiment.md",
+    "examples/experiment/full/README.md": "project/experiment.md",
     "tests/e2e/README.md": "project/e2e.md",
     "tests/e2e/PROOF.md": "project/e2e-proof.md",
     "tests/e2e/rig/README.md": "project/e2e-rig.md",

@@ -20,13 +20,13 @@ from demandops.repo.merge_check.rendered_charts import HELM_BIN
 from demandops.serve.generator import Generator
 from hypothesis import HealthCheck, settings
 
-from tests.kit import repo, sync
+from tests.kit import repo
 from tests.kit.cli import Run, runner
-from tests.kit.generator import running
 from tests.kit.limits import LONGEST_TEST_S
 from tests.kit.processes import Drivers
 from tests.kit.repo import GitRepo, Person
-from tests.kit.second_try import SecondTry
+from tests.kit.rig import running
+from tests.second_try import SecondTry
 
 _MEMORY = Path("/dev/shm")
 _ROOM_IN_MEMORY = 2 << 30
@@ -45,7 +45,7 @@ def pytest_configure(config: pytest.Config) -> None:
     # that long on a busy machine.
     settings.register_profile("steady", deadline=None, suppress_health_check=[HealthCheck.too_slow])
     settings.load_profile("steady")
-    sync.force(False)
+    repo.force_writes(False)
     gc.disable()  # until everything is imported and collected
     named = {"TMPDIR", "PYTEST_DEBUG_TEMPROOT"} & os.environ.keys()
     if not named and _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free >= _ROOM_IN_MEMORY:
@@ -102,7 +102,7 @@ def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def synced(request: pytest.FixtureRequest) -> bool:
     """Let only tests marked `synced` flush files to the disk; return whether this one is marked."""
     on = request.node.get_closest_marker("synced") is not None
-    sync.force(on)
+    repo.force_writes(on)
     return on
 
 
@@ -145,7 +145,7 @@ def bare_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def new_repo(bare_template: Path, tmp_path: Path, synced: bool) -> Callable[[str], Path]:
     def make(name: str) -> Path:
         made = Path(shutil.copytree(bare_template, tmp_path / name))
-        sync.force_in(made, synced)
+        repo.force_writes_in(made, synced)
         return made
 
     return make

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit import pages
+from tests.docs import pages
 from tests.kit.repo import git
 
 ROOT = Path(__file__).parents[2]
@@ -39,7 +39,7 @@ def test_commands_say_what_runs_them(page: str) -> None:
     untold = [block for block in BLOCKS[page] if block.has_commands and not block.tag]
     assert [f"{page}:{block.line}: {block.text.splitlines()[0]}" for block in untold] == [], (
         "put <!-- run -->, <!-- tested by tests/… --> or <!-- not run: WHY --> before the block "
-        "(tests/kit/pages.py)"
+        "(tests/docs/pages.py)"
     )
     for block in BLOCKS[page]:
         for path in re.findall(r"tests/[\w/.]*\w", block.tag):

@@ -20,8 +20,8 @@ from tests.e2e.common.rendered import DETECTION_TEMPLATE, check_chart
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.components import KINDS
 from tests.e2e.rig.kube import Manifest, build_manifest
+from tests.golden.cases import CASES, whole
 from tests.kit.cli import Run
-from tests.kit.golden import CASES, whole
 from tests.unit.render.test_inert import TRAPS, UNSEEN
 from tests.unit.render.test_yaml_as_helm import HELM_READS
 

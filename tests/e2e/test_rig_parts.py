@@ -17,9 +17,9 @@ import pytest
 from tests.e2e.rig import RigError, githttp, net, settings, tools
 from tests.e2e.rig.kube import Kube
 from tests.e2e.rig.processes import Component, Processes
-from tests.kit.generator import wait_until
 from tests.kit.http import kubeconfig, running
 from tests.kit.repo import git
+from tests.kit.rig import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 

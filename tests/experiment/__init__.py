@@ -1,4 +1,1 @@
-"""The paper's experiment with the event detector in place of scripted demands.
-
-`make experiment` runs it; see README.md beside it.
-"""
+"""What of the experiment a run of it does not show."""

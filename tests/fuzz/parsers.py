@@ -41,11 +41,12 @@ from demandops_ros import messages
 from hypothesis import strategies as st
 
 from tests.fuzz import Target
-from tests.kit import golden, plain_yaml, rich
-from tests.kit.cluster import Letters
+from tests.golden import cases as golden
+from tests.kit import forms, plain_yaml
 from tests.kit.config import state_of
 from tests.kit.goals import EXPERIMENT
 from tests.kit.memory import NOW
+from tests.unit.cluster.cases import Letters
 from tests.unit.demand.test_fuzz import ANYTHING, KEY, TEXT, assert_told, outcome
 
 _SEEDS = plain_yaml.load(Path(__file__).with_name("seeds.yaml").read_text())
@@ -108,7 +109,7 @@ def goal_as_data(data: Any) -> None:
 
 
 def _goals() -> st.SearchStrategy[Any]:
-    models = [rich.reference_goal(), rich.own_goal()]
+    models = [forms.reference_goal(), forms.own_goal()]
     return st.one_of(ANYTHING, *(_near(model, ANYTHING | TEXT) for model in models))
 
 
@@ -152,7 +153,7 @@ def data_to_ros_message(data: Any) -> None:
 
 # ---- files of the state repo ----
 
-_CONFIG = rich.rich()
+_CONFIG = forms.rich()
 _FILES = sorted(path for path in _CONFIG if "/charts/" not in path and "/values/" not in path)
 _CHARTS = sorted(path for path in _CONFIG if "/charts/" in path or "/values/" in path)
 
@@ -429,7 +430,7 @@ TARGETS = (
     Target(ros_message, values=st.one_of(map(_message, (Demand.Goal, DeploymentRequest.Goal)))),
     Target(
         data_to_ros_message,
-        values=_near(rich.own_goal(), ANYTHING) | st.dictionaries(KEY, ANYTHING),
+        values=_near(forms.own_goal(), ANYTHING) | st.dictionaries(KEY, ANYTHING),
         expected=(ValueError, TypeError, AssertionError, AttributeError, OverflowError),
     ),
     Target(config_file, _seeds_of(_FILES)),

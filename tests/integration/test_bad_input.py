@@ -20,11 +20,10 @@ from demandops.detect.rule_file import RuleFile
 
 from tests.integration.conftest import On
 from tests.kit import plain_yaml
+from tests.kit.forms import CONFIG_MODELS, GOAL_MODELS, Form, mutations, own_goal, reference_goal
 from tests.kit.goals import perception
 from tests.kit.limits import PATIENCE_S
-from tests.kit.mutations import Form, mutations
 from tests.kit.repo import GitRepo
-from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS, own_goal, reference_goal
 
 APPDEF = "appdefs/object-detection-fusion"
 CHART = f"{APPDEF}/charts/object-detection"

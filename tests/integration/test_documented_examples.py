@@ -9,20 +9,15 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import jsonschema_rs
 import pytest
 import yaml
-from click.testing import CliRunner
 from demandops.base.errors import Refused
-from demandops.cli.main import cli
-from demandops.decide.state import rendered_files
 from demandops.detect import rule_file
 from demandops.detect.detector import Detector
 from demandops.detect.event_engine import Observation
 from demandops.model.demand.demand import Demand
 from demandops.repo import new_repo
 from demandops.repo.history import commit_message
-from demandops.repo.merge_check.rendered_charts import manifest_faults
 
 from tests.kit.config import brokers, configuration, edited
 from tests.kit.goals import EXPERIMENT, put
@@ -40,10 +35,8 @@ _EDGE = "nodes:\n- {id: edge, type: edge, cluster: c-its,"
 
 def blocks(name: str) -> list[str]:
     """Return the indented code blocks of a document, without the indent."""
-    text = (DOCS / name).read_text()
-    return [
-        textwrap.dedent(found) for found in re.findall(r"(?:^ {4}.*\n|^\n(?= {4}))+", text, re.M)
-    ]
+    found = re.findall(r"(?:^ {4}.*\n|^\n(?= {4}))+", (DOCS / name).read_text(), re.M)
+    return [textwrap.dedent(text) for text in found]
 
 
 def block(name: str, start: str) -> str:
@@ -187,24 +180,19 @@ def test_the_application_definition_of_the_documentation_runs() -> None:
     }
 
 
-@pytest.mark.parametrize(
-    ("requester", "node", "start"),
-    [
+def test_the_policy_of_the_documentation_refuses_as_it_says() -> None:
+    repo = MemoryRepo({POLICY: block("policy.md", _DOMAINS.strip())})
+    assert repo.decide(demand()).outcome == "booked"
+    for requester, node, start in (
         ("vehicle01", "cloud", "not-allowed: requesters[0]: rule 'vehicles'"),
         ("truck7", "edge", "not-allowed: requesters[0]: no rule of"),
-    ],
-)
-def test_the_policy_of_the_documentation_refuses_as_it_says(
-    requester: str, node: str, start: str
-) -> None:
-    repo = MemoryRepo({POLICY: block("policy.md", _DOMAINS.strip())})
-    goal = demand() | {"requesters": [requester]}
-    (application,) = goal["applications"]
-    # its inputs are at its node, so it needs no connection that could be refused too
-    inputs = {"ego_data": [{"topic": "/vehicles/vehicle01/ego_data", "source": node}]}
-    goal["applications"] = [application | {"node": node, "inputs": inputs}]
-    assert refusal(repo, goal) == block("policy.md", start)
-    assert repo.decide(demand()).outcome == "booked"
+    ):
+        # its inputs are at its node, so it needs no connection that could be refused too
+        inputs = {"ego_data": [{"topic": "/vehicles/vehicle01/ego_data", "source": node}]}
+        (application,) = demand()["applications"]
+        apps = [application | {"node": node, "inputs": inputs}]
+        goal = demand() | {"requesters": [requester], "applications": apps}
+        assert refusal(repo, goal) == block("policy.md", start)
 
 
 def test_the_policy_of_the_documentation_lets_data_cross_by_its_rules_only() -> None:
@@ -215,16 +203,6 @@ def test_the_policy_of_the_documentation_lets_data_cross_by_its_rules_only() -> 
     said = refusal(MemoryRepo({POLICY: closed}), goal)
     told = block("policy.md", "not-allowed: requesters[0]: access domain 'fleet'")
     assert said.replace("rule 'everybody' of ", "") == told
-
-
-def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
-    path = "bootstrap/c-its.yaml"
-    on = MemoryRepo({POLICY: block("policy.md", _DOMAINS.strip())}).state
-    _, manifests = rendered_files(on)[path].split("\n---\n", 1)
-    assert not [*manifest_faults({path: manifests})]
-    kinds = [item["kind"] for item in yaml.safe_load_all(manifests)]
-    assert kinds.count("NetworkPolicy") == 1
-    assert "NetworkPolicy" not in rendered_files(MemoryRepo().state)[path]
 
 
 def test_the_node_in_several_domains_of_the_documentation() -> None:
@@ -323,23 +301,3 @@ def test_the_rules_of_the_documentation_form_demands_that_are_booked() -> None:
     ]
     for _, goal in (*perceived, *told, *counted):
         assert MemoryRepo().decide(goal.document).outcome == "booked"
-
-
-def test_each_schema_accepts_the_file_of_init_and_refuses_an_unknown_field(tmp_path: Path) -> None:
-    def schema(*args: str) -> str:
-        return CliRunner().invoke(cli, ["schema", *args]).output
-
-    files, checked = new_repo.files(), 0
-    for name, what in (line.split(maxsplit=1) for line in schema().splitlines()):
-        validator = jsonschema_rs.validator_for(yaml.safe_load(schema(name)))
-        path = what.partition(",")[0].replace("<name>", "object-detection-fusion")
-        if path in files:
-            found = yaml.safe_load(files[path])
-            assert validator.is_valid(found), name
-            assert not validator.is_valid(found | {"misspelt": 1}), name
-            checked += 1
-    assert checked == 9
-    assert jsonschema_rs.validator_for(yaml.safe_load(schema("demand"))).is_valid(demand())
-    written = tmp_path / "schemas"
-    assert schema("--write", str(written)) == f"17 schemas in {written}\n"
-    assert len(list(written.glob("*.json"))) == 17

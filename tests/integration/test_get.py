@@ -20,14 +20,16 @@ from demandops.repo.reader import Reader
 from demandops.views.kinds import KINDS
 
 from tests.integration.conftest import On
+from tests.kit.cli import terminal
+from tests.kit.cluster import kube_api
 from tests.kit.goals import EXPERIMENT, put
 from tests.kit.http import kubeconfig
-from tests.kit.kube_api import kube_api
-from tests.kit.repo import GitRepo
-from tests.kit.terminal import terminal
+from tests.kit.repo import GitRepo, Person
 
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 NOBODY = "http://127.0.0.1:9"
+LINK = {"id": "patrol/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
+LINK |= {"topics": [{"source": "/patrol"}]}
 
 pytestmark = pytest.mark.usefixtures("fleet")
 
@@ -35,9 +37,7 @@ pytestmark = pytest.mark.usefixtures("fleet")
 @pytest.fixture
 def fleet(on: On, state: GitRepo) -> GitRepo:
     """A state repo with the experiment's first two demands and a demand with a lease."""
-    link = {"id": "patrol/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
-    link |= {"topics": [{"source": "/patrol"}]}
-    leased = put("patrol", "vehicle00", applications=[], connections=[link], lease="10m")
+    leased = put("patrol", "vehicle00", applications=[], connections=[LINK], lease="10m")
     assert on("request", *EXPERIMENT[:2], "-", stdin=yaml.safe_dump(leased)).code == 0
     return state
 
@@ -142,6 +142,32 @@ def test_what_is_gone_has_its_past(on: On, fleet: GitRepo) -> None:
     assert "vehicle00" in on("get", "requesters", "--gone", "-o", "name").out.split()
     assert on("get", "demands", "--gone", "vehicle09").code == 1
     assert on("get", "nodes", "--gone").code == 2
+    (release,) = on.json("get", "releases", "od-edge-vehicle00", "--gone")["items"]
+    assert release["ended"]["commit"] == fleet.tip
+    for output in ("text", "wide"):
+        assert on("get", "releases", "--gone", "-o", output).code == 0
+    # what came back is still told
+    on.book(put("again", "vehicle00", applications=[], connections=[LINK]))
+    (item,) = on.json("get", "requesters", "vehicle00", "--gone")["items"]
+    assert (item["state"], item["ended"]["operation"]) == ("back", "decommission")
+    on("release", "again", "-y")
+    on.book(put("again", "vehicle00", applications=[], connections=[LINK]))
+    (item,) = on.json("get", "demands", "again", "--gone")["items"]
+    assert (item["state"], item["ended"]["operation"]) == ("back", "release")
+
+
+@pytest.mark.usefixtures("git_environment")
+def test_answered_proposals_are_gone(on: On, fleet: GitRepo, person: Person) -> None:
+    person.policy(approval="required")
+    for demand, answer in (("yes", "approve"), ("no", "reject")):
+        goal = put(demand, "vehicle02", applications=[], connections=[LINK | {"id": demand}])
+        on("demand", "-", stdin=yaml.safe_dump(goal))
+        (proposal,) = on.json("get", "proposals")["items"]
+        assert on(answer, proposal["name"], "-y", "--commit", proposal["commit"]).code == 0
+    items = on.json("get", "proposals", "--gone")["items"]
+    assert [item["ended"]["operation"] for item in items] == ["rejected", "approved"]
+    assert items[0]["ended"]["by"] == "Petra Platform"
+    assert on("get", "proposals", "--gone", "-o", "wide").code == 0
 
 
 class TestStatus:

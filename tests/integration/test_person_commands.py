@@ -8,10 +8,10 @@ from demandops.base import naming
 from demandops.cli.changes.configure import name_of
 
 from tests.integration.conftest import On
-from tests.kit.dialogue import CTRL_C, Dialogue
-from tests.kit.generator import running, wait_until
+from tests.kit.cli import CTRL_C, Dialogue
 from tests.kit.goals import perception
 from tests.kit.repo import GitRepo, git
+from tests.kit.rig import running, wait_until
 
 pytestmark = pytest.mark.usefixtures("git_environment")
 IDLE = "overrides/idle.yaml"

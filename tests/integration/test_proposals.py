@@ -10,11 +10,10 @@ import pygit2
 import pytest
 
 from tests.integration.conftest import On
-from tests.kit.cli import Run
-from tests.kit.dialogue import Dialogue
-from tests.kit.generator import running, wait_until
+from tests.kit.cli import Dialogue, Run
 from tests.kit.goals import perception, put
 from tests.kit.repo import GENERATOR_EMAIL, GENERATOR_NAME, GitRepo, Person, branches, git
+from tests.kit.rig import running, wait_until
 
 VISIT, OTHER = put("visit"), put("visit", topic=("/other", "vehicle00"))
 

@@ -19,8 +19,8 @@ from tests.integration.conftest import On
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.clock import Clock
-from tests.kit.generator import running, wait_until
 from tests.kit.repo import GitRepo, Person, branches, git, operations, root
+from tests.kit.rig import running, wait_until
 
 FIXTURE = Path(__file__).parents[1] / "fixtures" / "second-version"
 FACTS: dict[str, Any] = plain_yaml.load((FIXTURE / "facts.yaml").read_text())

@@ -52,7 +52,7 @@ class Step(FrozenModel):
     inside: str = ""
     exit: int = 0
     writes: bool | None = None
-    """Whether the command changes main. One that fails must not."""
+    """Whether the command changes main. One that fails must not, unless its story says so."""
     gives: dict[str, Any] = Field(default_factory=dict)
     """Parts of the command's JSON by path: ``items.0.name``, ``items.patrol.state`` for the item
     with this name, or ``items.*.name`` for the names of all.
@@ -166,7 +166,7 @@ class Teller:
         for path, part in step.leaves.items():
             text = files.get(path)
             assert part in (text or "") if part else text is None, (step.run, path, text)
-        writes = False if step.exit else step.writes
+        writes = False if step.exit and step.writes is None else step.writes
         assert writes in (None, self.repo.tip != before), step.run
 
 

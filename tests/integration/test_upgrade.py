@@ -23,11 +23,10 @@ from demandops.repo import upgrade
 from demandops.repo.git import remote_repository
 
 from tests.integration.conftest import On
-from tests.kit.cli import Ran, Run
-from tests.kit.dialogue import Dialogue
-from tests.kit.generator import book, running
+from tests.kit.cli import Dialogue, Ran, Run
 from tests.kit.goals import perception
 from tests.kit.repo import GitRepo
+from tests.kit.rig import book, running
 
 ROOT = Path(__file__).parents[2]
 PARTS = ("generator", "ros_bridge", "templates", "appdefs", "state-repo-skeleton")

@@ -1,74 +1,113 @@
-"""Status objects as a cluster reports them, and a stand-in for the Git history."""
+"""An API server with objects from a test; clients list, watch and annotate the objects."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
+import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
-from demandops.cluster.health import Health
+from tests.kit.http import Answer, Call, serving
 
-from tests.kit import plain_yaml
+Item = dict[str, Any]
 
-Case = dict[str, Any]
-"""A row of a table in YAML: the objects in a cluster, and the health that they must give."""
-
-
-class Letters:
-    """A history of commits named by letters; ``changing`` has pairs of commit and changed path."""
-
-    def __init__(self, changing: Iterable[tuple[str, str]] = ()) -> None:
-        self._changing = list(changing)
-
-    def includes(self, commit: str, other: str) -> bool:
-        return commit >= other
-
-    def unchanged(self, commit: str, other: str, path: str) -> bool:
-        first, last = sorted((commit, other))
-        return not any(first < one <= last and path == changed for one, changed in self._changing)
+_BEAT_S = 0.5
 
 
-def condition(kind: str, status: str, message: str = "") -> dict[str, str]:
-    at = "2026-05-04T12:00:00Z"
-    return {"type": kind, "status": status, "message": message, "lastTransitionTime": at}
+class KubeApi:
+    """The objects of one cluster; a kind's plural name, a namespace and a name identify each."""
+
+    def __init__(self) -> None:
+        self.url = ""
+        self.closed = False
+        self.patches: list[tuple[str, Item]] = []
+        """The path and the body of each patch."""
+        self.reads = 0
+        """How often objects were listed; what changes later is watched."""
+        self._changed = threading.Condition()
+        self._items: dict[tuple[str, str, str], Item] = {}
+        self._log: list[tuple[str, str, Item]] = []
+
+    def put(self, plural: str, namespace: str, name: str, status: Item, **more: Any) -> None:
+        with self._changed:
+            metadata = {"name": name, "namespace": namespace, "generation": 1}
+            metadata |= more.pop("metadata", {})
+            metadata["resourceVersion"] = str(len(self._log) + 1)
+            item = {"metadata": metadata, "status": status, **more}
+            self._items[plural, namespace, name] = item
+            self._log.append((plural, namespace, item))
+            self._changed.notify_all()
+
+    def patch(self, path: str, body: Item) -> None:
+        *_, namespace, plural, name = path.split("/")
+        with self._changed:
+            item = self._items.get((plural, namespace, name))
+            if item is not None:
+                more = {key: item[key] for key in item.keys() - {"metadata", "status"}}
+                annotations = item["metadata"].get("annotations", {})
+                annotations = annotations | body["metadata"]["annotations"]
+                metadata = item["metadata"] | {"annotations": annotations}
+                self.put(plural, namespace, name, item["status"], metadata=metadata, **more)
+            self.patches.append((path, body))
+
+    def listed(self, plural: str, namespace: str) -> Item:
+        with self._changed:
+            self.reads += 1
+            found = [item for key, item in self._items.items() if key[:2] == (plural, namespace)]
+            return {"metadata": {"resourceVersion": str(len(self._log))}, "items": found}
+
+    def answer(self, call: Call) -> Answer:
+        if call.method == "PATCH":
+            self.patch(call.path, call.json())
+            return Answer.json({})
+        address = urlsplit(call.path)
+        *_, namespace, plural = address.path.split("/")
+        query = parse_qs(address.query)
+        if "watch" not in query:
+            return Answer.json(self.listed(plural, namespace))
+        seconds = float(query.get("timeoutSeconds", ["inf"])[0])
+        events = self.events(plural, namespace, int(query["resourceVersion"][0]), seconds)
+        headers = {"Content-Type": "application/json"}
+        return Answer(headers=headers, body=(json.dumps(one).encode() + b"\n" for one in events))
+
+    def events(self, plural: str, namespace: str, since: int, seconds: float) -> Iterator[Item]:
+        """Yield the changes after a version, for some seconds or until the server is closed."""
+        end = time.monotonic() + seconds
+        while not self.closed and time.monotonic() < end:
+            with self._changed:
+                if len(self._log) == since:
+                    self._changed.wait(_BEAT_S)
+                new, since = self._log[since:], len(self._log)
+            for where, there, item in new:
+                if (where, there) == (plural, namespace):
+                    yield {"type": "MODIFIED", "object": item}
+
+    def flux(self, namespace: str, domain: str, commit: str) -> None:
+        revision = f"main@sha1:{commit}"
+        ready = {"type": "Ready", "status": "True"}
+        status = {"lastAppliedRevision": revision, "conditions": [ready]}
+        self.put("kustomizations", namespace, domain, status)
+
+    def helm_release(self, namespace: str, name: str, fault: str = "", since: str = "") -> None:
+        ready = {"type": "Ready", "status": "False" if fault else "True", "message": fault}
+        ready["lastTransitionTime"] = since or "2026-05-04T12:00:00Z"
+        status = {"observedGeneration": 1, "conditions": [ready]}
+        self.put("helmreleases", namespace, name, status)
+
+    def deployment(self, namespace: str, name: str, available: int = 1) -> None:
+        status = {"observedGeneration": 1, "updatedReplicas": 1, "availableReplicas": available}
+        self.put("deployments", namespace, name, status, spec={"replicas": 1})
 
 
-def deployment(name: str, *conditions: Any, of: str = "", **status: Any) -> dict[str, Any]:
-    labels = {"helm.toolkit.fluxcd.io/name": of} if of else {}
-    metadata = {"name": name, "namespace": "ns", "generation": 3, "labels": labels}
-    whole = {"observedGeneration": 3, "updatedReplicas": 2, "availableReplicas": 2}
-    found = whole | status | {"conditions": list(conditions)}
-    return {"metadata": metadata, "spec": {"replicas": 2}, "status": found}
-
-
-def read_cases(module: str, name: str) -> dict[str, list[Case]]:
-    """Return the tables of a YAML file beside a test module."""
-    tables: dict[str, list[Case]] = plain_yaml.load(Path(module).with_name(name).read_text())
-    return tables
-
-
-def deployments(case: Case) -> dict[tuple[str, str, str], dict[str, Any]]:
-    """Return the Deployments of a case; ``tracked`` is Argo CD's name of what they belong to."""
-    found = {}
-    for name, fields in case.get("deployments", {}).items():
-        status = {**fields}
-        conditions = [condition(*one) for one in status.pop("conditions", ())]
-        tracked = {"argocd.argoproj.io/tracking-id": status.pop("tracked", "")}
-        generation, replicas = status.pop("generation", 3), status.pop("replicas", 2)
-        made = deployment(name, *conditions, **status)
-        made["metadata"] |= {"annotations": tracked, "generation": generation}
-        made["spec"]["replicas"] = replicas
-        found["Deployment", "ns", name] = made
-    return found
-
-
-def told(health: Health, case: Case) -> Case:
-    """Return the case with the health that was found; what differs is then shown as a whole."""
-    found: Case = {**case, "state": health.state, "reason": health.reason, "object": health.object}
-    if health.reason.startswith(case.get("reason", "-")):
-        found["reason"] = case["reason"]
-    if health.failing:
-        found["failing"] = True
-    return {
-        name: value for name, value in found.items() if name in case or (value and name != "object")
-    }
+@contextmanager
+def kube_api() -> Iterator[KubeApi]:
+    api = KubeApi()
+    with serving(api.answer) as server:
+        api.url = server.url
+        try:
+            yield api
+        finally:
+            api.closed = True

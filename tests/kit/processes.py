@@ -1,24 +1,34 @@
-"""Generators in processes of their own, which tests can kill."""
+"""Generators in processes that tests can kill: the tests' end, and the program at the other end."""
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
+from demandops.model.demand.goals import read_journaled
+from demandops.repo.git.remote_repository import RemoteRepository
+from demandops.repo.git.repository import StateRepository
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.repo.write.proposal_branch import ProposalBranches
+from demandops.serve import agenda
+from demandops.serve.generator import Generator
+from demandops.serve.journal import Journal, Receipt, Ticket
+
 from tests.kit.goals import Goal
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import GIT_ENVIRONMENT
+from tests.kit.repo import GIT_ENVIRONMENT, force_writes
 
 _CHECKOUT = Path(__file__).parents[2]
 _SOURCES = (_CHECKOUT, _CHECKOUT / "generator", _CHECKOUT / "ros_bridge")
@@ -35,11 +45,6 @@ class Told:
     answers: dict[str, dict[str, Any]] = field(default_factory=dict)
     withdrawn: list[str] = field(default_factory=list)
     finished: bool | None = None
-    waits: dict[str, float] = field(default_factory=dict)
-    """The seconds from each demand to its answer."""
-    first: float = 0.0
-    last: float = 0.0
-    """When the first demand was sent, and the last event came."""
 
 
 class Run:
@@ -53,21 +58,16 @@ class Run:
 
     def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
         """Return all events at the end; ``on_ready`` is called when the process takes demands."""
-        sent: dict[str, float] = {}
         with self._pipe.open() as lines:
             for line in lines:
                 event = json.loads(line)
-                self._told.last = time.monotonic()
                 if "ready" in event:
                     self.pid = event["ready"]
                     on_ready()
                 elif "sent" in event:
                     self._told.sent.append(event["sent"])
-                    sent[event["sent"]] = self._told.last
-                    self._told.first = self._told.first or self._told.last
                 elif "answer" in event:
                     self._told.answers[event["answer"]] = event
-                    self._told.waits[event["answer"]] = self._told.last - sent[event["answer"]]
                 elif "withdrawn" in event:
                     self._told.withdrawn.append(event["withdrawn"])
                 elif "failed" in event:
@@ -89,7 +89,7 @@ class Drivers:
         self._runs: list[Run] = []
         self.synced = False
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.kit.driver"],
+            [sys.executable, "-m", "tests.kit.processes"],
             stdin=subprocess.PIPE,
             text=True,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, _SOURCES))},
@@ -145,3 +145,177 @@ def listen_to_all(
         except BaseException:
             drivers.kill_runs()  # otherwise the pool would wait for the runs for ever
             raise
+
+
+# ---- the program ----
+
+
+def tell(**event: object) -> None:
+    # a write of this size to a pipe is atomic, so lines of different threads do not mix
+    os.write(1, (json.dumps(event)[:4000] + "\n").encode())
+
+
+_POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
+    "journaled": (True, [(Journal, "append")]),
+    "committed": (True, [(CommitBatch, "commit")]),
+    "locked": (False, [(StateRepository, "publish")]),
+    "publishing": (False, [(RemoteRepository, "publish"), (StateRepository, "publish")]),
+    "published": (True, [(RemoteRepository, "publish"), (StateRepository, "publish")]),
+    "unanswered": (True, [(Journal, "mark_done")]),
+    "proposing": (False, [(ProposalBranches, "put")]),
+    "proposed": (True, [(ProposalBranches, "put")]),
+    "retracting": (False, [(ProposalBranches, "remove")]),
+}
+"""For each point: whether to kill the process after or before a call of one of the functions."""
+
+
+def arm(where: str, address: str) -> None:
+    """Let this process kill itself when it reaches a point for the n-th time."""
+    point, _, times = where.partition(":")
+    left = count(int(times or 1) - 1, -1)
+
+    def reach() -> None:
+        if next(left) <= 0:
+            if point == "locked":
+                Path(address, "refs", "heads", "main.lock").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+            threading.Event().wait()
+
+    if point == "withdrawn":
+        Lanes.withdrawn = staticmethod(reach)  # type: ignore[method-assign]
+        return
+    after, calls = _POINTS.get(point, (False, []))
+
+    def around(known: Any) -> Any:
+        def wrapped(*args: Any, **options: Any) -> Any:
+            if not after:
+                reach()
+            result = known(*args, **options)
+            if after:
+                reach()
+            return result
+
+        return wrapped
+
+    for owner, name in calls:
+        setattr(owner, name, around(getattr(owner, name)))
+
+
+def demand_of(goal: Any) -> Any:
+    """Return a rollback as the demand that the command makes, and any other goal as it is."""
+    is_rollback = isinstance(goal, dict) and goal.get("kind") == "Rollback"
+    return read_journaled(goal) if is_rollback else goal
+
+
+class Lanes:
+    """Clients; one marked ``withdraw`` is withdrawn once a demand of any lane is admitted."""
+
+    @staticmethod
+    def withdrawn() -> None:
+        """Do nothing; for a kill after a withdrawal, :func:`arm` replaces this method."""
+
+    def __init__(self, generator: Generator, lanes: list[list[dict[str, Any]]]) -> None:
+        self._generator = generator
+        self._lanes = [lane for lane in lanes if lane]
+        self._left = len(self._lanes)
+        self._lock = threading.Lock()
+        self._to_withdraw: list[dict[str, Any]] = []
+        self.ended = threading.Event()
+        if not self._left:
+            self.ended.set()
+
+    def start(self) -> None:
+        """Send the first demand of each lane; return when all of these are in the journal."""
+        wait([ticket.journaled for lane in self._lanes if (ticket := self._next(lane, 0))])
+
+    def _next(self, lane: list[dict[str, Any]], index: int) -> Ticket | None:
+        if index == len(lane):
+            with self._lock:
+                self._left -= 1
+                if not self._left:
+                    self.ended.set()
+            return None
+        tell(sent=lane[index]["name"])
+        if lane[index].get("withdraw"):
+            self._to_withdraw.append(lane[index])
+        ticket = self._generator.submit(
+            demand_of(lane[index]["goal"]),
+            lane[index]["operation"],
+            lambda stage, text: self._take_back() if stage == "admitted" else None,
+        )
+        ticket.future.add_done_callback(lambda future: self._answered(lane, index, future))
+        return ticket
+
+    def _take_back(self) -> None:
+        while self._to_withdraw:
+            item = self._to_withdraw.pop()
+            if self._generator.withdraw(item["operation"]):
+                tell(withdrawn=item["name"])
+                self.withdrawn()
+
+    def _answered(self, lane: list[dict[str, Any]], index: int, future: Future[Receipt]) -> None:
+        tell_answer(lane[index]["name"], future)
+        self._next(lane, index + 1)
+
+
+def tell_answer(name: str, future: Future[Receipt]) -> None:
+    if error := future.exception():
+        tell(answer=name, outcome=type(error).__name__, text=str(error), commit="")
+    else:
+        tell(answer=name, outcome=future.result().outcome, text="", commit=future.result().commit)
+
+
+def run(plan: dict[str, Any]) -> None:
+    force_writes(plan["synced"])
+    agenda.LONGEST_EVALUATION_S = 60.0  # so that no slow machine publishes a batch in two parts
+    arm(plan["die_at"], plan["address"])
+    generator = Generator(plan["address"])
+    tell(ready=os.getpid())
+    lanes = Lanes(generator, plan["lanes"])
+    if opening := plan["opening"]:
+        tell(sent=opening["name"])
+        ticket = generator.submit(
+            demand_of(opening["goal"]),
+            opening["operation"],
+            lambda stage, text: lanes.start() if stage == "admitted" else None,
+        )
+        ticket.future.add_done_callback(lambda future: tell_answer(opening["name"], future))
+    else:
+        lanes.start()
+    lanes.ended.wait()
+    tell(finished=generator.close(PATIENCE_S))
+
+
+def main() -> None:
+    """Import all modules once, and fork for every run; a run prints its events as lines of JSON.
+
+    Each run comes from standard input, as one line of JSON with these fields, among others:
+
+    - ``lanes``: clients, each a list of demands. A client waits for an answer before it sends its
+      next demand.
+    - ``opening``: a demand, or nothing. The lanes start while the worker is busy with this demand,
+      so that the first demands of the lanes become one batch.
+    - ``die_at``: ``<point>`` or ``<point>:<n>``; empty for no kill. The process gets SIGKILL when
+      it reaches the point for the first or the n-th time.
+    """
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr)
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for ended runs
+    for line in sys.stdin:
+        if os.fork():
+            continue
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        plan = json.loads(line)
+        os.environ.update(plan["environment"])
+        os.chdir(plan["cwd"])
+        os.dup2(os.open(plan["to"], os.O_WRONLY), 1)
+        try:
+            run(plan)
+        except BaseException as error:
+            logging.exception("the run ended early")
+            tell(failed=repr(error))
+        finally:
+            os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -22,6 +22,7 @@ import yaml
 from demandops.decide.bookkeeping import as_data, bookkeeping
 from demandops.decide.state import State
 from demandops.repo import new_repo, reader
+from demandops.repo.git import tree as _tree  # noqa: F401 - its import switches libgit2's fsync on
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.history.commit_message import GENERATOR_EMAIL, GENERATOR_NAME
 from demandops.repo.load import snapshot as snapshots
@@ -357,3 +358,24 @@ def first_version(path: Path, revision: str = "main") -> GitRepo:
     git(path.parent, "clone", "--quiet", "--bare", str(FIRST_VERSION), str(path))
     git(path, "update-ref", "refs/heads/main", f"{revision}^{{commit}}")
     return GitRepo(path)
+
+
+# ---- forced writes to disk ----
+
+_CALLS: Mapping[str, object] = {name: getattr(os, name) for name in ("fsync", "fdatasync")}
+
+
+def force_writes(on: bool) -> None:
+    """Switch fsync in this process on or off; it is on only in tests that are marked ``synced``.
+
+    Without fsync, a power cut can lose data, but a killed process loses none. The program has no
+    switch for fsync, so tests replace the functions that it calls.
+    """
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, int(on))
+    for name, call in _CALLS.items():
+        setattr(os, name, call if on else lambda file: None)
+
+
+def force_writes_in(repo: Path, on: bool) -> None:
+    """Switch git's fsync in a repository on or off."""
+    pygit2.Repository(str(repo)).config["core.fsync"] = "committed" if on else "none"

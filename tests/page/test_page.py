@@ -19,10 +19,10 @@ from playwright.sync_api import Browser, Route, expect
 
 from tests.kit import repo
 from tests.kit.browser import Visit, chromium
-from tests.kit.generator import book
 from tests.kit.http import Answer, serving
 from tests.kit.limits import PATIENCE_S
-from tests.kit.page_story import FAILING, Story, leased, released, story
+from tests.kit.rig import book
+from tests.page.story import FAILING, Story, leased, released, story
 
 expect.set_options(timeout=PATIENCE_S * 1000)
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from demandops_ros import DemandClient
 
-from tests.kit import sync
-from tests.kit.generator import wait_until
+from tests.kit import repo
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, init, tip
+from tests.kit.rig import wait_until
 from tests.kit.ros import Client, Serve, Served, Servers, reserved
 from tests.kit.warm_commands import WarmCommands
 from tests.scenarios import running
@@ -69,7 +69,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """
     folder = tmp_path_factory.mktemp("shared")
     bare = init(folder / "state.git")
-    sync.force_in(bare, False)
+    repo.force_writes_in(bare, False)
     changed = GitRepo(bare).commit({**running.configuration(["recorder"])})
     with reserved() as domain:
         servers = Servers(folder, domain, DEMANDOPS_DATA_HOME=str(folder / "home"))

@@ -23,9 +23,9 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
-from tests.kit.generator import wait_until
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import POLICY, GitRepo, git, tip
+from tests.kit.rig import wait_until
 from tests.kit.ros import Served
 
 REFUSED = plain_yaml.load(Path(__file__).with_name("refused.yaml").read_text())

@@ -23,10 +23,10 @@ from rosgraph_msgs.msg import Clock
 
 from examples.experiment import paper
 from tests.kit.detection import POSE, text_of
-from tests.kit.generator import wait_until
 from tests.kit.goals import put
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import POLICY, GitRepo, git
+from tests.kit.rig import wait_until
 from tests.kit.ros import Served, Servers
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "experiment" / "rules.yaml"

@@ -14,7 +14,7 @@ from demandops.model.demand.goals import read_goal
 from demandops_interfaces.srv import GetBookkeeping
 from demandops_ros.messages import demand_goal_from_data, demand_goal_to_data, fill_message
 
-from tests.kit import plain_yaml, rich
+from tests.kit import forms, plain_yaml
 
 REFUSED = plain_yaml.load(Path(__file__).with_name("refused.yaml").read_text())
 OURS = "application_manager_interfaces"
@@ -46,7 +46,7 @@ def test_the_bookkeeping_is_a_service() -> None:
 
 
 def test_a_message_carries_every_field_of_a_demand() -> None:
-    goal = rich.own_goal()
+    goal = forms.own_goal()
     carried = read_goal(demand_goal_to_data(demand_goal_from_data(goal)))
     assert carried.demanded == read_goal(goal).demanded
 

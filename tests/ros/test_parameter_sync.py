@@ -15,8 +15,8 @@ from demandops.base.errors import InvalidInput
 from demandops_ros.parameter_sync import parameters_of
 from rclpy.parameter import Parameter
 
+from tests.kit.cluster import KubeApi, kube_api
 from tests.kit.http import kubeconfig
-from tests.kit.kube_api import KubeApi, kube_api
 from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import Client, Served, Servers
 
@@ -52,8 +52,9 @@ def start_fusion(tmp_path: Path, ros_domain: int) -> Iterator[StartFusion]:
     environment = os.environ | {"ROS_DOMAIN_ID": str(ros_domain), "PYTHONFAULTHANDLER": "1"}
     names = ("raw_object_lists", "fused_object_lists", "fused_trajectories")
     topics = [f"{name}_topic:=/{name}" for name in names]
-    arguments = ["object_fusion", "fusion_function_launch.py", f"node_name:={TARGET}", *topics]
-    command = [sys.executable, "-m", "tests.experiment.standins", "launch", *arguments]
+    launch = ["ros2", "launch", "object_fusion", "fusion_function_launch.py"]
+    standin = [sys.executable, "-m", "examples.experiment.full.standins", *launch]
+    command = [*standin, f"node_name:={TARGET}", *topics]
     with ExitStack() as stack:
 
         def start() -> subprocess.Popen[bytes]:

@@ -17,9 +17,8 @@ from demandops_ros.detector.replay import REST_OF_BAG, Replay, show
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.kit.bag import write_bag
 from tests.kit.cli import Run
-from tests.kit.detection import POSE
+from tests.kit.detection import POSE, write_bag
 from tests.kit.goals import EXPERIMENT
 
 RULES = Path(__file__).parents[2] / "examples" / "experiment" / "rules.yaml"

@@ -55,7 +55,7 @@ class ExpectedFault(FrozenModel):
 
 _CHECKS = (
     "gives", "refused", "expires", "runs", "connections", "carries", "desired", "leases", "holds",
-    "warns", "waiting",
+    "warns", "waiting", "asks", "places",
 )  # fmt: skip
 
 
@@ -64,7 +64,7 @@ class Step(FrozenModel):
 
     ``config`` changes files as a person does, ``clock`` sets only the wall clock, ``restart``
     discards the generator's memory, and ``expires`` lists the demands that it then releases, in
-    order.
+    order. ``asks`` is who must approve the demand, and ``places`` why it got its nodes.
     """
 
     why: str = ""
@@ -77,6 +77,8 @@ class Step(FrozenModel):
     waiting: list[str] | None = None
     refused: list[ExpectedFault] | None = None
     warns: list[str] | None = None
+    asks: list[str] | None = None
+    places: list[str] | None = None
     expires: list[str] | None = None
     runs: dict[str, list[str]] | None = None
     connections: dict[str, list[str]] | None = None
@@ -95,8 +97,9 @@ class Step(FrozenModel):
             raise ValueError("holds is empty, or lists no words for a release")
         if self.send is not None and (self.gives is None) == (self.refused is None):
             raise ValueError("a step with send needs either gives or refused")
-        if self.send is None and (self.gives or self.refused or self.desired or self.warns):
-            raise ValueError("gives, refused, desired and warns need a demand; add send")
+        of_demand = (self.gives, self.refused, self.desired, self.warns, self.asks, self.places)
+        if self.send is None and any(of_demand):
+            raise ValueError("the effects of a demand need a demand; add send")
         return self
 
 
@@ -174,7 +177,7 @@ class World(MemoryRepo):
         moved_files = changed_claim_files(before, moved.ledger, moved.keys)
         for path, text in moved_files.items():
             ledger.pop(path) if text is None else ledger.update({path: text})
-        self.files = {**self._initial, **ledger, **rendered_files(self.state)}
+        self.files = {**self._initial, **ledger, **rendered_files(self.state, self.files)}
 
     def restart(self) -> None:
         self._lease_clock = Agenda(0, self.clock)
@@ -235,7 +238,7 @@ class World(MemoryRepo):
     def assert_sound(self) -> None:
         """Check that the files are exactly those of the ledger and of the ledger's releases."""
         assert ledger_in(self.files) == self.state.ledger
-        asked = rendered_files(self.state)
+        asked = rendered_files(self.state, self.files)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())
         assert not names, f"these files are missing, or no release needs them: {names}"
@@ -316,11 +319,14 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
     desired = sorted(f"{signs[release.change]} {release.what}" for release in taken.releases)
     if step.desired is not None and desired != sorted(step.desired):
         yield f"the desired state changes in another way: {desired}"
-    if step.warns is not None:
-        pairs = zip(step.warns, taken.warnings, strict=False)
-        fit = len(taken.warnings) == len(step.warns) and all(words in one for words, one in pairs)
-        if not fit:
-            yield f"warns of {taken.warnings}"
+    if step.asks not in (None, [*taken.approval]):
+        yield f"needs the approval of {taken.approval}"
+    for name, texts in (("warns", taken.warnings), ("places", taken.placed)):
+        wanted = getattr(step, name)
+        pairs = zip(wanted or (), texts, strict=False)
+        fit = len(texts) == len(wanted or ()) and all(words in one for words, one in pairs)
+        if wanted is not None and not fit:
+            yield f"{name}: {texts}"
 
 
 def same_faults(wanted: Iterable[ExpectedFault], found: Iterable[Fault]) -> bool:

@@ -193,7 +193,11 @@ def name_a_shared_route_twice(_: Any, routes: Any) -> Any:
 
 
 plant("deliver_under_the_source_topic", 3, Route, "written_topic", lambda _, one: one.source)
-plant("send_a_source_topic_to_two_targets", 4, booking, "_route_conflicts", lambda *_: ())
+
+
+@wrong(4, booking, "conflicts")
+def send_a_source_topic_to_two_targets(conflicts: Any, *given: Any, **more: Any) -> Any:
+    return [each for each in conflicts(*given, **more) if ".topics[" not in each.field]
 
 
 @wrong(1, decision, "affected_keys")
@@ -351,6 +355,26 @@ def book_again_what_was_approved(
 
 
 plant("turn_down_what_waits", 1, ProposalBranches, "put", lambda *_: "")
+
+
+# ---- answers, withdrawals and stops ----
+
+
+@wrong(0, journal.Journal, "mark_done")
+def note_outcomes_only_in_memory(
+    mark_done: Any, made: Any, operations: Any, *, durably: bool = False
+) -> None:
+    mark_done(made, operations)
+
+
+@wrong(0, Demands, "fail")
+def forget_what_a_stop_leaves(
+    fail: Any, made: Any, batch: Any, error: Any, keep: bool = False
+) -> None:
+    fail(made, batch, error)
+
+
+plant("say_that_all_is_withdrawn", 0, Demands, "withdraw", lambda *_: True)
 
 
 # ---- restart ----

@@ -19,7 +19,7 @@ import traceback
 from collections import Counter
 from pathlib import Path
 
-from tests.kit import sync
+from tests.kit import repo
 from tests.kit.repo import NO_GIT_CONFIG
 from tests.simulation.history import clean_up, play, template
 
@@ -29,7 +29,7 @@ RESULTS = Path("build/simulate.json")
 def main() -> int:
     os.environ.update(NO_GIT_CONFIG)
     logging.disable(logging.CRITICAL)
-    sync.force(False)
+    repo.force_writes(False)
     seed = int(os.environ.get("SEED") or random.SystemRandom().randrange(10**9))
     most = int(os.environ.get("HISTORIES") or 10**9)
     end = time.monotonic() + float(os.environ.get("SIMULATE_S") or 60)

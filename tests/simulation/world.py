@@ -26,7 +26,7 @@ from demandops.serve import generator
 from demandops.serve.generator import Generator
 from greenlet import getcurrent
 
-from tests.kit.turns import Turns
+from tests.kit.clock import Turns
 
 FETCH_INTERVAL_S = 30.0
 _JOURNAL = "outbox.jsonl"
@@ -87,6 +87,15 @@ class Machine(Runtime):
             self.crashes_in -= 1
             if not self.crashes_in:
                 self.crash()
+
+    def stop(self, timeout: float) -> None:
+        """Stop the generator; its threads have the time for what is queued, and the disk syncs."""
+        assert self.generator is not None
+        stopped = self.generator.stop(timeout)
+        self.turns.wait(lambda: stopped.done() or not self.is_up)
+        if self.is_up:
+            self.world.dead += self.threads
+            self.is_up, self.generator, self.crashes_in, self.threads = False, None, 0, []
 
     def crash(self) -> None:
         """Stop all threads and lose what is not on the disk, which they cannot reach."""

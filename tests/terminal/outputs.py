@@ -20,9 +20,9 @@ from demandops.cli.main import cli, load, run
 from demandops.repo.git import child_processes
 
 from tests.kit import plain_yaml
+from tests.kit.cli import terminal
 from tests.kit.goals import EXPERIMENT, put
 from tests.kit.repo import GIT_ENVIRONMENT, POLICY, GitRepo, git, init
-from tests.kit.terminal import terminal
 
 FOLDER = Path(__file__).parent / "expected"
 HELP = FOLDER / "help.txt"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit.dialogue import CTRL_C, Dialogue
+from tests.kit.cli import CTRL_C, Dialogue
 from tests.kit.http import kubeconfig
 from tests.kit.repo import GitRepo
 

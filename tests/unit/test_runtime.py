@@ -7,7 +7,7 @@ import logging
 import pytest
 from demandops.base.errors import StateRepoError, Unsound
 
-from tests.kit.turns import Turns
+from tests.kit.clock import Turns
 
 
 def test_a_thread_that_fails_is_started_again_and_told_once(

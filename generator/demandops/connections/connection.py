@@ -253,8 +253,9 @@ class Connection:
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        for end in self.nodes:
-            yield ("link", str(self.type), end)
+        if self.type:
+            yield ("link", self.type.name, self.source)
+            yield ("link", self.type.name, self.target)
         if self.broker:
             yield ("broker", self.broker)
         for route in self.topics:
@@ -290,6 +291,10 @@ class ClientKey:
 
 @dataclass(frozen=True, slots=True)
 class Client(ABC):
+    # the fields of its configuration that its program reads again while it runs; with a change of
+    # any other, the client restarts
+    reread: ClassVar[frozenset[str]] = frozenset()
+
     type: ConnectionType
     name: str
     node: Node
@@ -316,10 +321,6 @@ class Client(ABC):
 
     def written(self, configuration: Mapping[str, Any]) -> str:
         return strict_yaml.dump(configuration)
-
-    def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        # the part with whose change the client restarts
-        return configuration
 
     def settings(self, config: Config) -> ClientSettings:
         settings = config.clients.of(self.type.word)
@@ -405,6 +406,8 @@ class ConnectionType(ABC):
     needs_types: ClassVar[bool] = False
     # Whether a client restarts with each new route, so that a derived connection has only one
     one_derived_route: ClassVar[bool] = False
+    # What else the name of a connection names, in words; its clients meet there
+    channel: ClassVar[str] = ""
 
     def __repr__(self) -> str:
         return self.name
@@ -446,6 +449,8 @@ class ConnectionType(ABC):
     def names(self, key: ClientKey) -> Iterator[tuple[str, str]]:
         # (what it names, name) for each name that only the client at `key` may have
         yield "release", key.name
+        if self.channel and key.side == "source":  # both ends share it
+            yield self.channel, naming.object_name(self.word, key.id)
 
     @abstractmethod
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Client | None:

@@ -112,6 +112,10 @@ def _number(connection: str) -> int:
 class RosEnd(End):
     """Each route in ``topics`` has its message type set."""
 
+    # So a new topic restarts the router only if it needs an entry in `topics` (QoS settings) or
+    # `topic-routes` (reverse direction).
+    reread = frozenset({"allowlist"})
+
     # The id of the node that listens; its address is `wan`, and its port is `port`
     listener: str
     wan: Wan
@@ -167,11 +171,6 @@ class RosEnd(End):
                 },
             ],
         }
-
-    def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        # So a new topic restarts the router only if it needs an entry in `topics` (QoS settings) or
-        # `topic-routes` (reverse direction).
-        return {name: value for name, value in configuration.items() if name != "allowlist"}
 
 
 def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:

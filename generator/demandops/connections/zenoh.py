@@ -30,7 +30,7 @@ class Zenoh(routes.ConnectionType):
         # two bridges on one host and ROS domain do not work
         hosts: dict[tuple[object, ...], str] = {}
         for node in config.nodes.values():
-            host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
+            host = (node.cluster, node.ros.domain_id, *sorted(node.labels.items()))
             if node.zenoh and (other := hosts.setdefault(host, node.id)) != node.id:
                 file, place = reader.places[NODES_FILE][node.id]
                 yield fault(

@@ -47,7 +47,9 @@ def claims_of(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
 # ---- conflicts: a demand contradicts existing claims on the same application or connection ----
 
 
-def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fault]:
+def conflicts(  # noqa: PLR0912 - a branch for each contradiction
+    item: Item, ledger: Ledger, *, above: bool = False
+) -> Iterator[Fault]:
     """Yield the faults of an item that contradicts claims, or with ``above`` earlier items."""
     held = item.held
     against = f"contradicts {'an item above' if above else 'an existing claim'}"
@@ -85,41 +87,38 @@ def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fa
                 )
                 yield item.fault(name, message, code="conflict")
                 return
-        for each in _route_conflicts(item, held, claim.connection, against, holding):
-            if each.field not in told:
-                told.add(each.field)
-                yield each
-
-
-def _route_conflicts(
-    item: Item, demanded: Connection, booked: Connection, against: str, holding: str
-) -> Iterator[Fault]:
-    by_source = {route.source: route for route in booked.topics}
-    carried_back = {route.target: route for route in booked.topics if route.reverse}
-    for index, route in enumerate(demanded.topics):
-        where, current = f"topics[{index}]", by_source.get(route.source)
-        if current is None:
-            if route.reverse and (other := carried_back.get(route.target)):
+        by_source = {route.source: route for route in claim.connection.topics}
+        carried_back = {r.target: r for r in claim.connection.topics if r.reverse}
+        faults: list[tuple[str, str]] = []
+        for index, route in enumerate(held.topics):
+            where, carried = f"topics[{index}]", by_source.get(route.source)
+            if carried is None:
+                if route.reverse and (other := carried_back.get(route.target)):
+                    message = (
+                        f"connection {holding} and already carries '{route.target}' back to "
+                        f"'{other.source}'; a connection carries a target topic back to only one "
+                        "source topic, so use a second connection"
+                    )
+                    faults.append((f"{where}.target", message))
+                continue
+            if carried.target != route.target:
                 message = (
-                    f"connection {holding} and already carries '{route.target}' back to "
-                    f"'{other.source}'; a connection carries a target topic back to only one "
-                    "source topic, so use a second connection"
+                    f"connection {holding} and already carries '{route.source}' to "
+                    f"'{carried.target}'; a connection carries a source topic to only one "
+                    "target topic, so use a second connection"
                 )
-                yield item.fault(f"{where}.target", message, code="conflict")
-            continue
-        if current.target != route.target:
-            message = (
-                f"connection {holding} and already carries '{route.source}' to "
-                f"'{current.target}'; a connection carries a source topic to only one target "
-                "topic, so use a second connection"
-            )
-            yield item.fault(f"{where}.target", message, code="conflict")
-        for name, old, new in routes.contradictions(current, route):
-            message = (
-                f"{name} {new} of '{route.source}' {against}: {holding} with {name} {old}; use the "
-                f"same {name}"
-            )
-            yield item.fault(f"{where}.{name}", message, code="conflict")
+                faults.append((f"{where}.target", message))
+            for option, old, demanded in routes.contradictions(carried, route):
+                message = (
+                    f"{option} {demanded} of '{route.source}' {against}: {holding} with {option} "
+                    f"{old}; use the same {option}"
+                )
+                faults.append((f"{where}.{option}", message))
+        for field, message in faults:
+            conflict = item.fault(field, message, code="conflict")
+            if conflict.field not in told:
+                told.add(conflict.field)
+                yield conflict
 
 
 # ---- the operations: what each kind of request changes in the ledger ----

@@ -20,25 +20,23 @@ from demandops.decide import carriers, changeset, warnings
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.completing import (
     completed,
-    prepared,
+    with_chosen_domains,
     with_definitions,
     with_separate_instances,
 )
 from demandops.decide.booking import Drain, Restoration, apply, restoration_faults
 from demandops.decide.changeset import Changeset, FileReader, PlannedChange, ReleaseChange
 from demandops.decide.checks import collisions, forbidden
-from demandops.decide.checks.collisions import Names
 from demandops.decide.checks.forbidden import Difference
 from demandops.decide.placement import capacity, placement, relocation
 from demandops.decide.placement.candidates import NO_ROOM
-from demandops.decide.placement.capacity import Need
-from demandops.decide.planning.flows import flows_without_carrier, without_idle_holds
+from demandops.decide.planning import flows
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import State
+from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config
-from demandops.model.config.policy import matches
-from demandops.model.demand.demand import Application, Demand, Item
+from demandops.model.demand.demand import Application, Decommission, Demand, Item
 from demandops.model.demand.goals import goal_field, read_goal, size_faults
 from demandops.model.ledger.claim import demand_id
 from demandops.model.ledger.ledger import Changes, World, claim_changes, ledger_of
@@ -90,7 +88,7 @@ class Decision:
         """A sentence for each placed application or service: the chosen node and the reason."""
         if isinstance(self.request, Drain):
             return self.request.moved
-        return _once(*(text for item in self.request.demanded for text in item.placed))
+        return tuple(dict.fromkeys(text for item in self.request.demanded for text in item.placed))
 
     @property
     def lease_s(self) -> int | None:
@@ -145,14 +143,15 @@ def decide(
             the demand takes too much work.
         InvalidInput: if a file of the state repo prevents the rendering of a valid demand.
     """
-    demand = read_goal(goal, state.config.repo_settings.limits)
+    config = state.config
+    demand = read_goal(goal, config.repo_settings.limits)
     # what was booked must be released, however long that takes
     if demand.is_complete or not demand.adds_claims:
         checkpoint = _NO_LIMIT
     tell = cache(on_stage)  # once for each stage, because there may be several attempts
 
     def throttled(request: Demand) -> Demand:
-        if too_soon := tuple(throttle(request, state.config)):
+        if too_soon := tuple(throttle(request, config)):
             raise _TooSoon(too_soon)
         return request
 
@@ -172,13 +171,52 @@ def decide(
                 raise
             throttled(demand)
             booked = attempt(wait)
-        decision = _rendered(state, booked, read, checkpoint)
+        request, changes, after = booked.request, booked.changes, booked.after
+        rendered = changeset.render_change(
+            booked.planned,
+            config,
+            state.evaluate,
+            read,
+            keeps_late=request.operation not in _OUTCOMES,  # a release waits for no template
+            checkpoint=checkpoint,
+        )
+        checkpoint()
+        claims = [(change.before, change.after) for change in changes.claims]
+        required_by, approved_by = permission.approval(request, claims, config)
+        # a demand may list one thing twice, and several releases may have one reason
+        notes = dict.fromkeys(notes_on(request, state, after, changes, rendered))
+        for difference in booked.differing:
+            notes[difference.warning()] = None
+        reasons = (*required_by, *(each.approval_reason() for each in booked.differing))
     except OverBudget as spent:
         raise _refused(state, demand, [fault("", str(spent), code="too-large")]) from None
     except (_TooSoon, Refused) as refused:
         raise _refused(state, demand, refused.faults) from None
     tell("booked")
-    return decision
+    has_changes = bool(changes.claims or changes.waiting)
+    outcome: Outcome = "unchanged"
+    if has_changes or isinstance(request, Wait):
+        outcome = _OUTCOMES.get(request.operation, "released")
+    return Decision(
+        request=request,
+        outcome=outcome,
+        state=after,
+        changes=changes,
+        files=rendered.files if has_changes else {},
+        releases=rendered.releases,
+        warnings=tuple(filter(None, notes)),
+        approval=tuple(filter(None, dict.fromkeys(reasons))),
+        approved_by=approved_by,
+        overrides=rendered.overrides,
+        awaited=booked.makes_room
+        # a demand that waits for room for an application runs wherever another demand books it
+        or any(
+            subject in changes.subjects()
+            for waiting in state.ledger.waiting.values()
+            if waiting.demand != request.demand
+            for subject in waiting.put.subjects()
+        ),
+    )
 
 
 class _TooSoon(Exception):
@@ -219,9 +257,18 @@ def _searched(
     if faults := list(size_faults(demand, state.config.repo_settings.limits)):
         raise Refused(faults)
     checkpoint()
-    request, unclear = prepared(demand, state)
+    # all that does not depend on the nodes that are chosen for the demand
+    config, ledger = state.config, state.ledger
+    if isinstance(demand, Decommission):
+        nodes = config.nodes_of(demand.id)
+        return attempt(replace(demand, nodes=nodes, is_complete=True), ())
+    demand = with_definitions(demand, config)
+    # the id of a separate instance comes first, because the placement looks for claims on it
+    demand = with_separate_instances(demand, config)
+    demand, unclear = with_chosen_domains(demand, config, ledger)
+    demand, unread = flows.with_topics_of_outputs(demand, ledger, config)
     return placement.search(
-        request, state, lambda placed, faults: attempt(placed, (*unclear, *faults)), checkpoint
+        demand, state, lambda r, faults: attempt(r, (*unclear, *unread, *faults)), checkpoint
     )
 
 
@@ -303,11 +350,10 @@ class _Booked:
     changes: Changes
     planned: PlannedChange
     differing: Sequence[Difference]
-    grown: Mapping[Need, int]
-    names: Names
+    makes_room: bool
 
 
-def _booked(
+def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases request
     state: State, request: Demand, now: datetime, read: FileReader, checkpoint: Checkpoint
 ) -> _Booked:
     if isinstance(request, Drain):
@@ -332,7 +378,7 @@ def _booked(
         ledger = ledger.without(ledger.kept_claims(subject))
     ledger, changes = apply(ledger, request, now)
     if not isinstance(request, Restoration):
-        ledger, idle = without_idle_holds(ledger, changes.claims)
+        ledger, idle = flows.without_idle_holds(ledger, changes.claims)
         ends = [*idle, *(change.key for change in changes.claims)]
         ended = claim_changes(state.ledger, ledger, ends)
         ledger, routes = carriers.without_idle_routes(ledger, state.config, ended)
@@ -372,64 +418,13 @@ def _booked(
     if refused := [difference.fault for difference in differing if difference.is_refused]:
         raise Refused(refused)
     grown = capacity.growth(planned.former, planned.plans, state.config)
+    refusal = capacity.NoRoom(state.usage(), grown, state.config)
     # a drain was tried on its nodes already, and what releases claims makes room
-    if request.adds_claims or isinstance(request, Restoration):
-        capacity.refuse_excess(state.usage(), grown, state.config)
-    return _Booked(request, after, changes, planned, differing, grown, names)
-
-
-# ---- render ----
-
-
-def _rendered(state: State, booked: _Booked, read: FileReader, checkpoint: Checkpoint) -> Decision:
-    request, changes, config = booked.request, booked.changes, state.config
-    rendered = changeset.render_change(
-        booked.planned,
-        config,
-        state.evaluate,
-        read,
-        keeps_late=request.operation not in _OUTCOMES,  # a release waits for no template
-        checkpoint=checkpoint,
-    )
-    checkpoint()
-    usage = state.usage().plus(booked.grown)
-    after = state.followed_by(booked.after.ledger, booked.planned, usage, booked.names)
-    checkpoint()
-    claims = [(change.before, change.after) for change in changes.claims]
-    required_by, approved_by = permission.approval(request, claims, config)
-    outcome: Outcome = "unchanged"
-    if changes.claims or changes.waiting or isinstance(request, Wait):
-        outcome = _OUTCOMES.get(request.operation, "released")
-    return Decision(
-        request=request,
-        outcome=outcome,
-        state=after,
-        changes=changes,
-        files=rendered.files if changes.claims or changes.waiting else {},
-        releases=rendered.releases,
-        # a demand may list one thing twice, and several releases may have one reason
-        warnings=_once(
-            *notes_on(request, state, after, changes, rendered),
-            *(difference.warning() for difference in booked.differing),
-        ),
-        approval=_once(
-            *required_by, *(difference.approval_reason() for difference in booked.differing)
-        ),
-        approved_by=approved_by,
-        overrides=rendered.overrides,
-        awaited=any(amount < 0 for amount in booked.grown.values())
-        # a demand that waits for room for an application runs wherever another demand books it
-        or any(
-            subject in changes.subjects()
-            for waiting in state.ledger.waiting.values()
-            if waiting.demand != request.demand
-            for subject in waiting.put.subjects()
-        ),
-    )
-
-
-def _once(*texts: str) -> tuple[str, ...]:
-    return tuple(filter(None, dict.fromkeys(texts)))
+    if refusal.full and (request.adds_claims or isinstance(request, Restoration)):
+        raise refusal
+    after = state.followed_by(ledger, planned, state.usage().plus(grown), names)
+    makes_room = any(amount < 0 for amount in grown.values())
+    return _Booked(request, after, changes, planned, differing, makes_room)
 
 
 # ---- notes for the requester, in addition to the outcome ----
@@ -445,7 +440,7 @@ def notes_on(
     # a connection that an override denies carries nothing
     ledger = without_suspended(after).ledger
     for app in request.applications if request.adds_claims else ():
-        for flow in flows_without_carrier(after.config, app, ledger):
+        for flow in flows.flows_without_carrier(after.config, app, ledger):
             yield (
                 f"application '{app.id}': no connection carries {flow.key.topic} ({flow.name}) of "
                 f"'{flow.key.sender}' to '{flow.key.receiver}'"
@@ -498,7 +493,7 @@ def may_demand(
         if word and word not in known:
             raise Refused.at(field, f"'{word}' is not known{suggestion(word, known)}")
     answer = Answer(node, (fault("node", "no node is in an access domain"),), (), ())
-    for name in [node] if node else sorted(config.domain_of):
+    for name in [node] if node else [*sorted(config.domain_of), *config.example_nodes()]:
         held = Application(f"may/{requester}", appdef, name, version=version)
         demanded = (Item(held, (requester,)),)
         demand = Demand("put", "may", demanded, f"may/{requester}", (requester,))

@@ -19,8 +19,8 @@ from demandops.base.strict_yaml import located_in
 from demandops.detect import condition as conditions
 from demandops.detect.condition import Count, FieldPath, Hours, Near, Threshold, Together
 from demandops.model.config import base_model
-from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text
-from demandops.model.config.policy import Duration, Patterns, matches
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, matches
+from demandops.model.config.policy import Duration, Patterns
 from demandops.model.demand.goals import form_faults
 
 # ---- the template of a demand: plain data in whose texts ``{entity}`` stands for a value ----

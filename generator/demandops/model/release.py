@@ -94,7 +94,8 @@ class ServiceRelease:
         return self.service.images
 
     def image(self, name: str, config: Config) -> Image:
-        return self.shaping.image(name, self.version.image(name, config.images[name]))
+        image, pin = config.images[name], self.version.images.get(name)
+        return self.shaping.image(name, pin.over(image) if pin else image)
 
     @property
     def description(self) -> str:
@@ -124,7 +125,7 @@ class ServiceRelease:
         yield self.service.file, entry, "its definition"
         if self.service.place:
             yield self.service.file, f"{entry}.place".lstrip("."), "what its node must have"
-        yield config.values_template(self.service), "", "its Helm values"
+        yield self.service.values, "", "its Helm values"
         if self.version.name:
             entry = f"applications.{self.version.appdef}.versions.{self.version.name}"
             yield config.file_of(VERSIONS_FILE, self.version.appdef), entry, "its version"

@@ -14,8 +14,9 @@ from typing import Any
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput, Refused
 from demandops.base.settings import MAIN_BRANCH
-from demandops.connections.connection import UNSUPPORTED, Client
+from demandops.connections.connection import UNSUPPORTED
 from demandops.model.config.config import IMAGES_FILE, Config
+from demandops.model.config.entry_patterns import any_value_of, is_pattern
 from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.override import format_time
 from demandops.model.config.policy import AccessDomain
@@ -52,9 +53,9 @@ def bootstrap_path(cluster: str) -> str:
 def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
     """Return (cluster, access domain) for each domain with nodes in the cluster, sorted."""
     pairs = {
-        (node.cluster, config.domain_of[node.id].name)
-        for node in config.nodes.values()
-        if node.id in config.domain_of
+        (node.cluster, domain.name)
+        for node in config.kinds_of_nodes()
+        for domain in config.domains_at(node)
     }
     return [(cluster, config.domains[name]) for cluster, name in sorted(pairs)]
 
@@ -103,21 +104,52 @@ def render(release: Release, config: Config, evaluate: Evaluate) -> str:
 
     Helm values and the plain manifests of connections are the same for Flux and Argo CD.
     """
-    if not isinstance(release, ServiceRelease):
-        return render_connection(release, config)
-    values, chart = values_of(release, config, evaluate), release.chart
-    repository = config.repo_settings
+    if isinstance(release, ServiceRelease):
+        values, chart = values_of(release, config, evaluate), release.chart
+        repository = config.repo_settings
+        return engine.text(
+            f"{repository.gitops}/release.yaml.j2",
+            release=release,
+            chart=chart,
+            chart_kind="OCIRepository" if chart.oci else "HelmChart",
+            chart_name=chart_object(release.service.chart, chart),
+            values=values,
+            project=project_of(release.domain, repository),
+            repository=repository,
+            branch=MAIN_BRANCH,
+            server=IN_CLUSTER,
+        )
+    # The file of a client: a Deployment, and a ConfigMap with its configuration. Each type of
+    # connection has a template and a schema in ``templates/connections/<type>/``. The schema lists
+    # the fields that the client's program reads; tests compare configurations with it.
+    kind, node = release.type, release.node
+    if kind.image not in config.images:
+        message = (
+            f"'{kind.image}' is in use, but not in {config.place_of(IMAGES_FILE)}; add it there"
+        )
+        raise Refused.at("images", message, code=UNSUPPORTED)
+    configuration, settings = release.configuration(), release.settings(config)
+    # A client reads these fields only at its start. Their checksum is an annotation of the pod, so
+    # that a change of them restarts the pod, and a change of other fields does not.
+    at_start = {name: configuration[name] for name in configuration if name not in release.reread}
     return engine.text(
-        f"{repository.gitops}/release.yaml.j2",
-        release=release,
-        chart=chart,
-        chart_kind="OCIRepository" if chart.oci else "HelmChart",
-        chart_name=chart_object(release.service.chart, chart),
-        values=values,
-        project=project_of(release.domain, repository),
-        repository=repository,
-        branch=MAIN_BRANCH,
-        server=IN_CLUSTER,
+        f"connections/{kind.word}/client.yaml.j2",
+        client=release,
+        configuration=release.written(configuration),
+        checksum=hashlib.sha256(release.written(at_start).encode()).hexdigest(),
+        node=node,
+        selector=node.labels,
+        tolerations=[item.model_dump(exclude_defaults=True) for item in node.tolerations],
+        settings=settings,
+        env=release.environment(settings) | settings.env,
+        probes={
+            f"{name}Probe": probe
+            for name in ("startup", "readiness", "liveness")
+            if (probe := getattr(settings, f"{name}_probe"))
+        },
+        resources=settings.resources.model_dump(),
+        host_network=node.host_network if settings.host_network is None else settings.host_network,
+        image=release.shaping.image(kind.image, config.images[kind.image]).reference(),
     )
 
 
@@ -132,7 +164,7 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
 
     InvalidInput names the template, the schema or the override at fault.
     """
-    template = config.values_template(release.service)
+    template = release.service.values
     if release.autoscaler and release.autoscaler.max == 0:
         by = [each.path for each, effects in release.shaping.by if "replicas" in effects]
         # seen on a cluster: the 0 stayed when the override ended, as no autoscaler starts from 0
@@ -146,7 +178,7 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
         "service": release.key.service,
         "node": {
             "id": node.id,
-            "selector": node.labels(),
+            "selector": node.labels,
             "tolerations": [item.model_dump(exclude_defaults=True) for item in node.tolerations],
             "image_pull_secrets": list(node.image_pull_secrets),
             "host_network": node.host_network,
@@ -168,7 +200,7 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
         },
         "outputs": dict(release.outputs),
         "parameters": dict(release.parameters),
-        "requests": config.repo_settings.requests_of_pods(release.service.requests),
+        "requests": release.service.pod_requests,
         "images": {name: release.image(name, config).parts() for name in release.service.images},
     }
     # Never both. A template that knows only ``replicas`` must fail, because the GitOps controller
@@ -199,44 +231,6 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
         raise type(error)(faults) from None
 
 
-# ---- the file of a communication client: a Deployment, and a ConfigMap with its configuration ----
-#
-# Each connection type has a template and a schema in ``templates/connections/<type>/``. The schema
-# lists the fields that the client program reads; tests compare configurations with it.
-
-
-def render_connection(client: Client, config: Config) -> str:
-    kind, node = client.type, client.node
-    if kind.image not in config.images:
-        message = (
-            f"'{kind.image}' is in use, but not in {config.place_of(IMAGES_FILE)}; add it there"
-        )
-        raise Refused.at("images", message, code=UNSUPPORTED)
-    configuration, settings = client.configuration(), client.settings(config)
-    # A client reads these fields only at its start. Their checksum is an annotation of the pod, so
-    # that a change of them restarts the pod, and a change of other fields does not.
-    at_start = client.written(client.read_at_start(configuration))
-    return engine.text(
-        f"connections/{kind.word}/client.yaml.j2",
-        client=client,
-        configuration=client.written(configuration),
-        checksum=hashlib.sha256(at_start.encode()).hexdigest(),
-        node=node,
-        selector=node.labels(),
-        tolerations=[item.model_dump(exclude_defaults=True) for item in node.tolerations],
-        settings=settings,
-        env=client.environment(settings) | settings.env,
-        probes={
-            f"{name}Probe": probe
-            for name in ("startup", "readiness", "liveness")
-            if (probe := getattr(settings, f"{name}_probe"))
-        },
-        resources=settings.resources.model_dump(),
-        host_network=node.host_network if settings.host_network is None else settings.host_network,
-        image=client.shaping.image(kind.image, config.images[kind.image]).reference(),
-    )
-
-
 def kept_charts(
     files: Mapping[str, str], current: Mapping[str, str], world: World
 ) -> dict[str, str]:
@@ -265,12 +259,18 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
     """Return the expression that is true for the selectors of the domain's nodes."""
     by_label: dict[str, set[str]] = {}
     selectors: set[tuple[tuple[str, str], ...]] = set()
-    for node in config.nodes.values():
+    by_pattern = list[str]()
+    for node in config.kinds_of_nodes():
         if node.selector is None or node.cluster != cluster:
             continue
-        if config.domain_of.get(node.id) is not domain:
+        if domain not in config.domains_at(node):
             continue
-        if len(node.selector) == 1:
+        if is_pattern(node.id):
+            (entry,) = (each for each in config.node_patterns if each.id == node.id)
+            written = entry.data["selector"].items()
+            tests = [_has(k, f".matches({_text(f'^{any_value_of(v)}$')})") for k, v in written]
+            by_pattern.append(f"({' && '.join(tests) or 'true'})")
+        elif len(node.selector) == 1:
             ((label, value),) = node.selector.items()
             by_label.setdefault(label, set()).add(value)
         else:
@@ -284,7 +284,7 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
     for selector in sorted(selectors):
         labels = " && ".join(_has(label, f" == {_text(value)}") for label, value in selector)
         parts.append(f"({labels or 'true'})")  # a node with ``selector: {}`` takes every pod
-    return " || ".join(parts)
+    return " || ".join((*parts, *sorted(by_pattern)))
 
 
 def expression_of(pattern: str) -> str:

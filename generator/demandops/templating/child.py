@@ -52,7 +52,7 @@ def serve(memory_mib: int) -> None:
 def _answer(files: dict[str, str], question: bytes) -> dict[str, Any]:
     try:
         parts = json.loads(question)
-        task = ValuesTask(**parts) if "template" in parts else SchemaTask(**parts)
+        task = ValuesTask(**parts) if "context" in parts else SchemaTask(**parts)
         return {"values": evaluate(files, task)}
     except InvalidInput as error:
         return {"faults": [asdict(fault) for fault in error.faults]}

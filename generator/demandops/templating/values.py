@@ -135,18 +135,13 @@ _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")
 class ValuesTask:
     """What the values of a service are computed from; all paths are those of the state repo."""
 
-    template: str
+    file: str  # the template; named if the task takes too long
     context: Mapping[str, Any]
     chart: str | None  # its folder, if it is in the state repo
     # The values of overrides in the order in which they apply, each with the override's path
     patches: tuple[tuple[str, Any], ...] = ()
     # What each pod requests of its node, by Kubernetes' names
     requests: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def file(self) -> str:
-        # named if the task takes too long
-        return self.template
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,13 +167,13 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
         return {}
     text = _rendered(files, task)
     try:
-        values = _mapping(text, task.template)
+        values = _mapping(text, task.file)
         if task.chart and task.requests:
             values = _with_requests(values, task.requests, charts.defaults(task.chart, files))
         if task.chart:
-            _check(values, task.chart, files, task.template, "the template")
+            _check(values, task.chart, files, task.file, "the template")
     except InvalidInput as error:
-        template = files[task.template]
+        template = files[task.file]
         raise InvalidInput(with_template_lines(error.faults, template, text)) from None
     below: dict[str, Any] | None = None
     if task.chart and task.patches:
@@ -226,23 +221,23 @@ def _rendered(files: Mapping[str, str], task: ValuesTask) -> str:
         return None if text is None else (text, path, lambda: True)
 
     try:
-        text = Sandbox(load).get_template(task.template).render(**task.context)
+        text = Sandbox(load).get_template(task.file).render(**task.context)
         if len(text) <= _MAX_RENDERED:
             return text
         problem, line = f"writes {len(text)} characters; at most {_MAX_RENDERED} are allowed", None
     except TemplateNotFound as error:
-        problem, line = f"'{error.name}' does not exist", _line(error, task.template)
+        problem, line = f"'{error.name}' does not exist", _line(error, task.file)
     except TemplateSyntaxError as error:
         problem, line = str(error.message), error.lineno
     except TemplateError as error:
-        problem, line = str(error) or type(error).__name__, _line(error, task.template)
+        problem, line = str(error) or type(error).__name__, _line(error, task.file)
     except MemoryError:  # a limit of this process, and so nobody's fault for sure
         raise
     except Exception as error:  # whatever an expression raises, only the template's author mends it
-        problem, line = f"{type(error).__name__}: {error}", _line(error, task.template)
+        problem, line = f"{type(error).__name__}: {error}", _line(error, task.file)
     # each process has other addresses, and all generators must write the same problem report
     message = f"{_ADDRESS.sub('', problem)}; fix the template"
-    raise InvalidInput([fault("", message, line=line).within(task.template)])
+    raise InvalidInput([fault("", message, line=line).within(task.file)])
 
 
 def _line(error: Exception, template: str) -> int | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
@@ -16,15 +16,10 @@ from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_message import GENERATOR_NAME
+from demandops.views.rows import RANKS
 from demandops.views.source import Source, claims_behind, since_of, word_of
 
 Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
-
-# The color of each kind of cause, in the order in which people see the kinds.
-KINDS: dict[str, str] = {
-    **dict.fromkeys(("unread", "failing", "invalid", "suspended"), "bad"),
-    **dict.fromkeys(("decision", "waiting", "starting"), "busy"),
-}
 
 # What kubelet and the scheduler write into a pod's status, which the reason of a release quotes.
 _IMAGE = re.compile(r"ImagePull|ErrImage|InvalidImage|manifest unknown|pull access denied", re.I)
@@ -75,7 +70,7 @@ def causes(source: Source) -> list[Cause]:
     """Return every cause, the worst kind first, then the oldest."""
     every = [*_unread_or_invalid(source), *_denied(source)]
     every += [*_not_ready(source), *_awaited(source)]
-    every.sort(key=lambda cause: ([*KINDS].index(cause.kind), cause.since or source.now))
+    every.sort(key=lambda cause: (RANKS[cause.kind], cause.since or source.now))
     return every
 
 
@@ -150,11 +145,17 @@ def _denied(source: Source) -> Iterator[Cause]:
         )
 
 
-def _applications_with(source: Source, claims: Iterable[Claim]) -> Iterator[str]:
-    """Yield the ids of all applications of the demands to which these claims belong."""
+def _applications_with(source: Source, claims: Collection[Claim]) -> Iterator[str]:
+    """Yield the ids of the applications that need these claims: those of the claims' demands.
+
+    A suspended application that others demand too runs on for them.
+    """
+    keys = {claim.key for claim in claims}
     for demand in dict.fromkeys(claim.demand for claim in claims):
-        held = source.claims_of_demands.get(demand, ())
-        yield from (claim.subject.id for claim in held if claim.is_on_application)
+        for claim in source.claims_of_demands.get(demand, ()):
+            runs_on = claim.key in keys and source.active.ledger.claims_on(claim.subject)
+            if claim.is_on_application and not runs_on:
+                yield claim.subject.id
 
 
 def _not_ready(source: Source) -> Iterator[Cause]:

@@ -23,10 +23,13 @@ from demandops.decide.bookkeeping import (
 from demandops.decide.planning.overrides import suspended_by
 from demandops.model.config.base_model import duration_text, parse_time, relative
 from demandops.model.config.config import DOMAINS_FILE
-from demandops.model.ledger.claim import Claim, requesters_of
+from demandops.model.config.entry_patterns import is_pattern
+from demandops.model.config.override import OVERRIDES_ROOT
+from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
+from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.views import vocabulary
 from demandops.views.rows import Column, Row, TextsOf
 from demandops.views.source import Source, since_of, word_of, worst_word
@@ -49,6 +52,12 @@ class Kind:
     # Further texts by which an item is found, by label.
     labels: Callable[[Json], dict[str, Iterable[str]]] = lambda item: {}
     trailer: str = ""  # of commits: names what their commit changes, so that its past can be listed
+    # What an item has that is gone, beside nulls; None if its past cannot be listed.
+    blank: Json | None = None
+
+    @property
+    def has_past(self) -> bool:
+        return bool(self.trailer) or self.blank is not None
 
     @property
     def word(self) -> str:
@@ -90,34 +99,49 @@ def rows_of(source: Source, name: str) -> list[Row]:
     return [row for _, row in made.values()]
 
 
+# The operations that end what their commit names.
+_ENDING = frozenset({"shutdown", "release", "expire", "decommission", "rollback"})
+
+
 def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
     """Return what is gone, the newest first, and the commit where the search ended, if it did.
 
-    The newest commit that names a thing which is not there now is the one that ended it.
+    The newest commit that names a thing which is not there now is the one that ended it. What came
+    back is listed too: nothing of it ended since what is there now began.
     """
-    kind, past = KINDS[name], dict[str, Json]()
-    present = {row.item["name"] for row in rows_of(source, name)}
-    for number, entry in enumerate(source.reader().log(source.commit)):
+    kind, past, reader = KINDS[name], dict[str, Json](), source.reader()
+    began: dict[str, datetime | None] = {}  # what is there now; None if it was never gone
+    for row in rows_of(source, name):
+        since = row.item.get("since") if kind.trailer else None
+        began[row.item["name"]] = parse_time(since) if since else None
+    stopped = reader.stopped_releases(source.commit) if name == "releases" else {}
+    for number, entry in enumerate(reader.log(source.commit)):
         if number == MOST_COMMITS:
             return [*map(kind.row, past.values())], entry.commit
-        trailers = entry.trailers
-        named = trailers.get(kind.trailer, ())
-        for gone in (each for each in named if each not in present):
-            ended = {
-                "time": time_data(entry.time),
-                "by": entry.author,
-                "operation": entry.first("Operation") or None,
-                "commit": entry.commit,
-            }
-            item: Json = {column.key: None for column in kind.columns}
-            item |= {"name": gone, "state": "gone", "ended": ended, "requesters": []}
-            item |= {"applications": [], "connections": []}
+        by, time, operation = entry.author, entry.time, entry.first("Operation")
+        named = entry.trailers.get(kind.trailer, stopped.get(entry.commit, ()))
+        if name == "proposals" and entry.answer:
+            by, time, operation = entry.answer.by, entry.answer.time, entry.answer.outcome
+            # of a rejection, the branch and the commit that was proposed
+            named = named or [entry.first(REJECTS).partition(" ")[0]]
+        for gone in named:
+            if gone in began:
+                now = began[gone]
+                if now and entry.time > now and operation in _ENDING:
+                    began[gone] = now = None
+                if now is None or (gone not in past and operation not in _ENDING):
+                    continue
+            item: Json = {column.key: None for column in kind.columns} | (kind.blank or {})
+            item |= {"name": gone, "state": "back" if gone in began else "gone"}
+            item |= {"requesters": [], "applications": [], "connections": []}
+            item["ended"] = {"time": time_data(time), "by": by, "operation": operation or None}
+            item["ended"]["commit"] = entry.commit
             item = past.setdefault(gone, item)
             item["since"] = time_data(entry.time)  # of the oldest commit that names it
             if len(named) == 1 and not item["requesters"]:  # what a commit names is all of it
-                item["requesters"] = trailers.get("Requester", [])
-                item["applications"] = trailers.get("Application", [])
-                item["connections"] = trailers.get("Connection", [])
+                item["requesters"] = entry.trailers.get("Requester", [])
+                item["applications"] = entry.trailers.get("Application", [])
+                item["connections"] = entry.trailers.get("Connection", [])
     return [*map(kind.row, past.values())], ""
 
 
@@ -165,7 +189,7 @@ def _wide(key: str, title: str, links: str = "", texts_of: TextsOf | None = None
 
 def _command(title: str, words_of: Callable[[Json], list[str]]) -> Column:
     def text(item: Json, now: datetime) -> str:
-        return shlex.join(words_of(item))
+        return "" if item.get("ended") else shlex.join(words_of(item))
 
     return Column("name", title, 9, "command", text, only_wide=True)
 
@@ -210,20 +234,14 @@ def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> list[str]:
 # ---- what is held: demands, applications, claims, leases and requesters ----
 
 
-def _state(source: Source, claims: Sequence[Claim]) -> str:
-    # A claim is held by its demand, kept by an override, or suspended by an override. What has
-    # claims in several states is partly suspended.
-    states = {
-        "suspended"
-        if suspended_by(claim, source.state)
-        else "kept"
-        if claim.keeping_override
-        else "held"
-        for claim in claims
-    }
-    (state,) = states if len(states) == 1 else ("partly suspended",)
-    is_over = any(claim.lease and claim.lease.has_ended(source.now) for claim in claims)
-    return "overdue" if state == "held" and is_over else state
+def state_of(source: Source, claims: Sequence[Claim]) -> str:
+    # a claim is held by its demand, kept by an override, or suspended by an override
+    active = [claim for claim in claims if not suspended_by(claim, source.state)]
+    if len(active) < len(claims):
+        return "partly suspended" if active else "suspended"
+    if any(claim.lease and claim.lease.has_ended(source.now) for claim in claims):
+        return "overdue"
+    return "kept" if all(claim.keeping_override for claim in claims) else "held"
 
 
 def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
@@ -246,7 +264,7 @@ def _demands(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     held = source.claims_of_demands.items()
     for id, claims in sorted(held, key=lambda pair: (min(c.booked for c in pair[1]), pair[0])):
         runs = _runs(source, source.releases_of_demands.get(id, []))
-        yield id, (claims, _state(source, claims), runs)
+        yield id, (claims, state_of(source, claims), runs)
     for waiting in source.state.ledger.waiting.values():
         yield f"waiting {waiting.demand}", (waiting, "waiting", {"releases": [], "health": None})
 
@@ -290,7 +308,7 @@ def _applications(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     ledger = source.state.ledger
     for id in ledger.subjects(SubjectKind.APPLICATION):
         claims = ledger.application_claims(id)
-        yield id, (claims, _state(source, claims), _runs(source, releases[id]))
+        yield id, (claims, state_of(source, claims), _runs(source, releases[id]))
 
 
 def _application(source: Source, claims: tuple[Claim, ...], state: str, runs: Json) -> Json:
@@ -308,12 +326,36 @@ def _application(source: Source, claims: tuple[Claim, ...], state: str, runs: Js
 
 def _claims(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     for claim in sorted(source.state.ledger, key=lambda claim: (str(claim.subject), claim.demand)):
-        yield f"{claim.subject} {claim.demand}", (claim, _state(source, [claim]))
+        yield f"{claim.subject} {claim.demand}", (claim, state_of(source, [claim]))
 
 
-def _claim(source: Source, claim: Claim, state: str) -> Json:
-    data = claim_data(claim)
-    return {"name": data["file"], **_held(source, [claim], state), **data}
+def claim_item(source: Source, claim: Claim, state: str) -> Json:
+    data, denying = claim_data(claim), suspended_by(claim, source.state)
+    kept = source.config.overrides.get(claim.keeping_override or "")
+    way = f"send request '{claim.request}' again with shutdown: true"
+    if claim.keeping_override is not None:
+        way = f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
+    elif is_released_by_demand_id(claim):
+        way = f"send 'operation: release' for demand '{claim.demand}'"
+    return {
+        "name": data["file"],
+        **_held(source, [claim], state),
+        **data,
+        "release_by": way,
+        "kept_by": vocabulary.override_data(kept, ("keep",)) if kept else None,
+        "suspended_by": vocabulary.override_data(denying, ("deny",)) if denying else None,
+    }
+
+
+def is_released_by_demand_id(claim: Claim) -> bool:
+    # A goal of the reference's action has no demand id. The generator derives it from the request.
+    is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
+    return claim.keeping_override is None and not is_of_a_request
+
+
+def _suspending(item: Json, now: datetime) -> list[str]:
+    override = item["suspended_by"]
+    return [override["name"]] if override else []
 
 
 def _subject(item: Json, now: datetime) -> list[str]:
@@ -346,7 +388,7 @@ def _requesters(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
                 for name in source.releases_of_demands.get(demand, ())
             }
         )
-        state = _state(source, claims) if claims else "waiting"
+        state = state_of(source, claims) if claims else "waiting"
         yield requester, (requester, claims, state, waiting[requester], _runs(source, releases))
 
 
@@ -373,6 +415,11 @@ def _releases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
         name = planned.target.name
         status = source.status(name) if source.statuses else None
         yield name, (planned.release, planned.claims, status)
+
+
+def release_of(source: Source, release: Release) -> Json:
+    status = source.status(release.name) if source.statuses else None
+    return _release(source, release, source.claims_of_releases[release.name], status)
 
 
 def _services(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -482,13 +529,17 @@ def _nodes(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
         for id in nodes_of(claim):
             needing[id].append(claim)
     # A claim may need a node that a person removed from the inventory.
-    for id in sorted({*source.config.nodes, *needing}):
+    for id in sorted({*(node.id for node in source.config.kinds_of_nodes()), *needing}):
         yield id, (id, needing[id], _runs(source, sorted(running[id])))
 
 
 def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
     node, domain = source.config.nodes.get(id), source.config.domain_of.get(id)
     state = "open" if node else "not in the inventory"
+    if is_pattern(id):  # it stands for all nodes that it matches
+        (node,) = (each for each in source.config.kinds_of_nodes() if each.id == id)
+        state, possible = "pattern", source.config.domains_at(node)
+        domain = possible[0] if len(possible) == 1 else None
     return {
         "name": id,
         "state": "drained" if node and node.drained else state,
@@ -514,10 +565,12 @@ def _properties(item: Json, now: datetime) -> list[str]:
 
 def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     nodes: defaultdict[str, list[str]] = defaultdict(list)
-    for id, domain in sorted(source.config.domain_of.items()):
-        nodes[domain.name].append(id)
+    clusters: defaultdict[str, set[str]] = defaultdict(set)
+    for node in sorted(source.config.kinds_of_nodes(), key=lambda node: node.id):
+        for domain in source.config.domains_at(node):
+            nodes[domain.name].append(node.id)
+            clusters[domain.name].add(node.cluster)
     for name, domain in sorted(source.config.domains.items()):
-        clusters = {source.config.nodes[id].cluster for id in nodes[name]}
         item = {
             "name": name,
             "namespace": domain.namespace,
@@ -525,7 +578,7 @@ def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
             "when_full": domain.when_full,
             "network": domain.network,
             "rules": len(domain.rules),
-            "clusters": sorted(clusters),
+            "clusters": sorted(clusters[name]),
             "nodes": nodes[name],
             "file": source.config.file_of(DOMAINS_FILE, name),
         }
@@ -594,11 +647,7 @@ def _events(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 
 def event(entry: LogEntry) -> Json:
-    data = vocabulary.commit_data(entry)
-    who = ", ".join(data["requesters"]) or data["author"]
-    if data["operation"] in ("rollback", "reject"):  # a person did it to what others hold
-        who = f"{data['author']}, for {', '.join(data['requesters'])}"
-    return {"name": entry.commit, **data, "who": who}
+    return {"name": entry.commit, **vocabulary.commit_data(entry)}
 
 
 def _told(commit: Json, now: datetime) -> str:
@@ -647,12 +696,14 @@ KINDS: dict[str, Kind] = {
             "releases",
             "Helm releases and the clients of connections, each shared by all who need it.",
             (
-                *(_named("release"), HEALTH, Column("reason", "Reason", 1, texts_of=_reason)),
+                *(_named("release"), HEALTH, ENDED),
+                Column("reason", "Reason", 1, texts_of=_reason),
                 *(_NODE, replace(REQUESTERS, rank=4), _FOR, SINCE, _VERSION, _CLUSTER),
                 Column("seen", "Seen", 9, texts_of=lambda item, now: (item["seen"] or "")[:10]),
             ),
             _releases,
             _release,
+            blank={"versions_asked": {}, "application_version": None, "object": None},
         ),
         Kind(
             "services",
@@ -754,12 +805,13 @@ KINDS: dict[str, Kind] = {
             "claims",
             "What one demand holds of one subject.",
             (
-                *(Column("subject", "Subject", texts_of=_subject), STATE, REQUESTERS),
+                *(Column("subject", "Subject", texts_of=_subject, links="held"), STATE, REQUESTERS),
                 *(Column("demand", "Demand", 3, links="demand"), LEASE, SINCE),
+                Column("suspended_by", "Suspended by", 7, texts_of=_suspending, links="override"),
                 *(_wide("request", "Request"), _wide("file", "File")),
             ),
             _claims,
-            _claim,
+            claim_item,
             lambda item: {
                 item["subject"]["kind"]: [item["subject"]["id"]],
                 "kind": [item["subject"]["kind"]],
@@ -790,7 +842,7 @@ KINDS: dict[str, Kind] = {
             "proposals",
             "Changes that a person approves by merging a branch, or refuses by deleting it.",
             (
-                *(Column("name", "Branch"), _COMMIT, REQUESTERS),
+                *(Column("name", "Branch"), _COMMIT, ENDED, REQUESTERS),
                 *(Column("since", "Since", 3, "time"), Column("summary", "What", 1)),
                 *(Column("required_by", "Required by", 4), Column("link", "Link", 5)),
                 _wide("demands", "Demands", "demand"),
@@ -799,6 +851,8 @@ KINDS: dict[str, Kind] = {
                 _command("Refuse", lambda item: _decide(item, "reject")),
             ),
             _proposals,
+            trailer=PROPOSAL,
+            blank={"commit": ""},
         ),
         Kind(
             "events",

@@ -9,23 +9,21 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any, Literal, TypeVar
 
-from demandops.model.config.base_model import parse_time, relative
-from demandops.model.config.policy import matches
+from demandops.model.config.base_model import matches, parse_time, relative
 from demandops.views.vocabulary import Json
 
-# The tone of each word for a state: the color on a terminal and on the page.
+# The tone of each word for a state, which is its color on a terminal and on the page. The worst
+# words come first.
 TONES = {
-    **dict.fromkeys(("failing", "suspended", "not in the inventory"), "bad"),
-    **dict.fromkeys(
-        ("starting", "waiting", "decision", "partly suspended", "overdue", "drained", "expired"),
-        "busy",
-    ),
+    **dict.fromkeys(("unread", "failing", "invalid", "suspended", "denied", "rejected"), "bad"),
+    "not in the inventory": "bad",
+    **dict.fromkeys(("decision", "proposed", "waiting", "starting", "partly suspended"), "busy"),
+    **dict.fromkeys(("overdue", "drained", "expired"), "busy"),
     **dict.fromkeys(("held back", "matches nothing", "not rendered yet"), "busy"),
-    **dict.fromkeys(("unknown", "kept", "open", "gone"), "none"),
-    **dict.fromkeys(("healthy", "held", "in force"), "good"),
+    **dict.fromkeys(("unknown", "kept", "open", "gone", "back"), "none"),
+    **dict.fromkeys(("healthy", "held", "runs", "used", "in force", "approved", "exists"), "good"),
 }
-
-_RANKS = {word: place for place, word in enumerate(TONES)}  # the worst comes first
+RANKS = {word: float(place) for place, word in enumerate(TONES)}
 
 # The texts of a cell at a moment.
 TextsOf = Callable[[Json, datetime], "str | Iterable[str]"]
@@ -54,7 +52,7 @@ class Column:
         value = item.get(self.key)
         if self.form == "state":
             (word,) = self.texts(item, now) or ("",)
-            return not word, float(_RANKS.get(word, len(_RANKS))), word
+            return not word, RANKS.get(word, float(len(RANKS))), word
         if self.key == "lease" and value:
             value = value["until"]
         if isinstance(value, int | float):

@@ -37,6 +37,7 @@ from demandops.decide.planning.planner import denied_release, plan
 from demandops.decide.planning.release_keys import ReleaseKey, takes
 from demandops.decide.state import State
 from demandops.model.config.config import Config
+from demandops.model.config.inventory import Node
 from demandops.model.config.override import Override
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger, World, changes_on
@@ -45,20 +46,9 @@ from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.snapshot import Problem, Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
+from demandops.views.rows import RANKS
 
 # ---- the health of a release in one word ----
-
-# The words for a health, each with its color on the page, from the worst to the best health.
-WORDS = {
-    "failing": "bad",
-    "waiting": "busy",
-    "starting": "busy",
-    "unknown": "none",
-    "healthy": "good",
-}
-
-# The index of each word in `WORDS`; a lower index means worse health.
-RANKS = {word: float(place) for place, word in enumerate(WORDS)}
 
 
 def word_of(status: ReleaseStatus) -> str:
@@ -156,6 +146,13 @@ class Source:
         problems, remedy = reader.problems_of(snapshot), reader.how_to_mend(snapshot)
         own = reader.for_another_thread
         return cls(snapshot, entry, REAL.now(), own, problems, remedy, **more)
+
+    @property
+    def nodes(self) -> Mapping[str, Node]:
+        """The listed nodes, and those of patterns that claims need."""
+        known = self.config.nodes
+        used = self.state.ledger.indexed_names("node") if self.config.node_patterns else set()
+        return {**known, **{id: known[id] for id in used if id in known}}
 
     def taking_over(self, before: Source) -> Source:
         """Plan only what may differ from an earlier source; its other releases and rows are kept.
@@ -356,18 +353,3 @@ class Source:
     def unwatched(self) -> list[str]:
         used = {target.domain.cluster for _, target in self.targets}
         return sorted(used - self.watched)
-
-
-@dataclass(frozen=True, slots=True)
-class HealthChange:
-    time: datetime
-    release: str
-    before: str  # a word of `WORDS`, as `after` is
-    after: str
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Commit:
-    entry: LogEntry
-    roots: tuple[str, ...]  # the top-level files and folders that it changed

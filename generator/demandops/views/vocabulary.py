@@ -107,18 +107,22 @@ def decision_text(decision: Json) -> str:
 
 
 def commit_data(entry: LogEntry) -> Json:
-    answer = entry.answer
+    answer, requesters = entry.answer, entry.trailers.get("Requester", [])
+    who = ", ".join(requesters) or entry.author
+    if entry.first("Operation") in ("rollback", "reject"):  # a person did it to what others hold
+        who = f"{entry.author}, for {who}"
     return {
         "commit": entry.commit,
         "time": time_data(entry.time),
         "author": entry.author,
+        "who": who,
         "summary": entry.summary,
         "why": entry.why or None,
         "operation": entry.first("Operation") or None,
         "operation_id": entry.first("Operation-Id") or None,
         "request": entry.first("Request-Id") or None,
         "demands": entry.trailers.get("Demand-Id", []),
-        "requesters": entry.trailers.get("Requester", []),
+        "requesters": requesters,
         "applications": entry.trailers.get("Application", []),
         "connections": entry.trailers.get("Connection", []),
         "render_version": entry.first("Render-Version") or None,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from demandops.base.errors import (
     DemandOpsError,
@@ -23,13 +23,11 @@ from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.decide.decision import Decision, decide
 from demandops.decide.override_report import affected_releases
-from demandops.decide.planning.overrides import suspended_by
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.config import DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
-from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import Claim, demand_id, requesters_of
+from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.records import waiting_path
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import domain_folder, path_of
@@ -38,15 +36,14 @@ from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.repo.load import ledger_files
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
+from demandops.views import kinds
 from demandops.views.kinds import effect_texts, nodes_of
-from demandops.views.source import Source, by_booking, since_of, word_of
+from demandops.views.source import Source, by_booking
 from demandops.views.vocabulary import (
     Json,
-    claim_data,
     commit_data,
     override_data,
     place_data,
-    release_data,
     subject_data,
     time_data,
 )
@@ -63,6 +60,8 @@ _TOLD_APART = KINDS[:3]
 _MOST_LISTED = 8
 # The trailer that names the thing in the commits that are about it.
 _TRAILERS = {"demand": "Demand-Id", "requester": "Requester"}
+# What an override selects by name.
+_SELECTED = ("requester", "application", "connection", "service", "appdef", "node")
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +97,15 @@ def find(source: Source, name: str, kind: str | None = None) -> Thing:
     # a part of a release's name, or the start of a demand's id; what runs before what has ended
     running = sorted(release for release in source.releases if name in release)
     demands = sorted(id for id in _demands(source) if id.startswith(name))
-    ended = sorted(reader.stopped_release_names(source.commit))
+    stopped = reader.stopped_releases(source.commit).values()
+    ended = sorted({release for names in stopped for release in names})
     were = [release for release in ended if name in release]
+    past = {id for entry in reader.log(source.commit) for id in entry.trailers.get("Demand-Id", ())}
     for each, names, what in (
         ("release", running, "releases have {} in their name"),
         ("demand", demands, "demand ids begin with {}"),
         ("release", were, "releases have {} in their name"),
+        ("demand", sorted(id for id in past if id.startswith(name)), "demand ids begin with {}"),
     ):
         if kind in (None, each) and names:
             if len(names) > 1:
@@ -247,7 +249,10 @@ def explain(source: Source, thing: Thing, most: int = 10) -> Json:
 
 
 # The states in which a thing has an effect now
-_RUNNING = ("runs", "held", "partly suspended", "used", "in force", "not rendered yet")
+_RUNNING = (
+    *("runs", "held", "kept", "overdue", "partly suspended"),
+    *("used", "in force", "not rendered yet"),
+)
 
 
 def _proposals(source: Source, thing: Thing) -> Iterator[PendingProposal]:
@@ -260,14 +265,10 @@ def _proposals(source: Source, thing: Thing) -> Iterator[PendingProposal]:
 
 def _release(source: Source, thing: Thing) -> Json:
     if release := source.releases.get(thing.name):
-        status = source.status(thing.name) if source.statuses else None
         return {
-            **place_data(release),
+            **kinds.release_of(source, release),
             **_held(source, source.claims_of_releases[thing.name]),
             "state": "runs",
-            "health": word_of(status) if status else None,
-            "health_reason": status.health.reason if status else "",
-            "health_since": time_data(since_of(status)) if status else None,
             "shaped_by": [
                 {"file": file, "entry": entry or None, "what": what}
                 for file, entry, what in shaping_files(release, source.config)
@@ -285,7 +286,8 @@ def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]
     # (file, entry, what it decides) for all that shapes a release but overrides
     images = {name: config.images[name] for name in release.images if name in config.images}
     if isinstance(release, ServiceRelease):
-        images = {name: release.version.image(name, image) for name, image in images.items()}
+        pins = release.version.images
+        images |= {name: pins[name].over(images[name]) for name in images if name in pins}
     node, domain, file_of = release.node, release.domain, config.file_of
     return [
         (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
@@ -425,44 +427,15 @@ def _releases_for(source: Source, claims: Iterable[Claim]) -> Iterator[Release]:
             yield source.releases[name]
 
 
-def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | None = None) -> Json:
-    rows, suspended = [], 0
-    for claim in claims:
-        denying = suspended_by(claim, source.state)
-        suspended += denying is not None
-        kept = source.config.overrides.get(claim.keeping_override or "")
-        way = f"send request '{claim.request}' again with shutdown: true"
-        if claim.keeping_override is not None:
-            way = f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
-        elif is_released_by_demand_id(claim):
-            way = f"send 'operation: release' for demand '{claim.demand}'"
-        rows.append(
-            claim_data(claim)
-            | {
-                "release_by": way,
-                "overdue": claim.lease is not None and claim.lease.has_ended(source.now),
-                "kept_by": override_data(kept, ("keep",)) if kept else None,
-                "suspended_by": override_data(denying, ("deny",)) if denying else None,
-            }
-        )
-    state = "partly suspended" if suspended else "held"
-    if suspended == len(claims):
-        state = "suspended" if claims else "gone"
-    data: Json = {"state": state, "requesters": list(requesters_of(claims)), "claims": rows}
-    if releases is not None:
-        by_name = {release.name: release for release in releases}
-        data["releases"] = [
-            release_data(release)
-            | ({"health": word_of(source.status(name))} if source.statuses else {})
-            for name, release in sorted(by_name.items())
-        ]
-    return data
-
-
-def is_released_by_demand_id(claim: Claim) -> bool:
-    # A goal of the reference's action has no demand id. The generator derives it from the request.
-    is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
-    return claim.keeping_override is None and not is_of_a_request
+def _held(source: Source, claims: list[Claim], releases: Iterable[Release] = ()) -> Json:
+    by_name = {release.name: release for release in releases}
+    states = [kinds.state_of(source, [claim]) for claim in claims]
+    return {
+        "state": kinds.state_of(source, claims) if claims else "gone",
+        "requesters": list(requesters_of(claims)),
+        "claims": [kinds.claim_item(source, *each) for each in zip(claims, states, strict=True)],
+        "releases": [kinds.release_of(source, by_name[name]) for name in sorted(by_name)],
+    }
 
 
 # ---- the past ----
@@ -485,6 +458,13 @@ def _past(source: Source, reader: Reader, thing: Thing, most: int) -> Json:
         history = PathHistory(started, tuple(about[:most]), more, stopped)
     elif thing.path:
         history = reader.history(thing.path, source.commit, most)
+    if thing.kind in _SELECTED:
+        log, listed = reader.log(source.commit), {entry.commit for entry in history.newest}
+        edits = (entry for entry in log if reader.edits(entry, thing.kind, thing.name))
+        newest = [*history.newest, *(entry for entry in edits if entry.commit not in listed)]
+        newest.sort(key=lambda entry: entry.time, reverse=True)
+        more = history.more + max(len(newest) - most, 0)
+        history = replace(history, newest=tuple(newest[:most]), more=more)
 
     def row(entry: LogEntry | None) -> Json | None:
         if entry is None:

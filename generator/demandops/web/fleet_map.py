@@ -15,8 +15,8 @@ from typing import Any
 from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
 from demandops.views.kinds import rows_of
-from demandops.views.rows import Filter, Row, exactly
-from demandops.views.source import RANKS, WORDS, Source, word_of
+from demandops.views.rows import RANKS, TONES, Filter, Row, exactly
+from demandops.views.source import Source, word_of
 from demandops.views.vocabulary import Json
 
 # A drawing for wide screens and one for phones, of which the style sheet shows one: its width, the
@@ -121,7 +121,7 @@ class Line:
 def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     # A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a
     # position.
-    known = source.config.nodes
+    known = source.nodes
     nodes = sorted(known.values(), key=lambda node: (node.cluster, node.id))
     spots = _spots(nodes)
     layouts = ("cluster", "place") if spots else ("cluster",)
@@ -152,7 +152,7 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
             if isinstance(release, ServiceRelease)
             else f"{release.type.word} {', '.join(release.connections)}"
         )
-        tone, is_lit = WORDS[word_of(source.status(release.name))], release.name in lit_releases
+        tone, is_lit = TONES[word_of(source.status(release.name))], release.name in lit_releases
         marks[release.node.id].append(Mark(text, tone, isinstance(release, ServiceRelease), is_lit))
     chosen = set[str]()
     for node in nodes if wanted else ():
@@ -342,7 +342,7 @@ class Drawing:
             worst = min((link["health"] or "unknown" for link in carried), key=RANKS.__getitem__)
             if is_filtered and not is_lit:
                 continue
-            is_late = WORDS[worst] in ("bad", "busy")
+            is_late = TONES[worst] in ("bad", "busy")
             if len(between) > _MOST_LINES and not (is_lit or is_late):
                 self.is_cut = True
                 continue
@@ -353,7 +353,7 @@ class Drawing:
             singles = [card for card in (upper, lower) if not card.is_stack]
             query = " ".join(exactly("node", card.nodes[0].id) for card in singles)
             path = self._path(upper, lower)
-            self.lines.append(Line(path, WORDS[worst], is_lit, query, title))
+            self.lines.append(Line(path, TONES[worst], is_lit, query, title))
 
     def _path(self, upper: Card, lower: Card) -> str:
         # it goes down through a gap between the cards of each row on its way

@@ -18,7 +18,10 @@ from demandops.repo.git.repository import reading
 from demandops.repo.load.snapshot import Progress
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
-from demandops.views.source import Commit, HealthChange, Source, word_of
+from demandops.views.source import Source, word_of
+from demandops.views.vocabulary import commit_data
+from demandops.web import time_line
+from demandops.web.time_line import Event
 
 log = logging.getLogger("demandops")
 
@@ -58,13 +61,13 @@ class Follower:
         self._push_denied = push_denied
         self._caches = object_caches(clusters, self._wake.set, REAL)
         self._words: dict[str, str] = {}  # for the health of each release, as last seen
-        self._changes = deque[HealthChange](maxlen=_MOST_CHANGES)
+        self._changes = deque[Event](maxlen=_MOST_CHANGES)
         self._earlier: dict[str, Source] = {}
         self._loading = REAL.lock()
         # Browsers fetch the page again when this number changes.
         self.version = 0
         # The newest commits, at most `MOST_COMMITS`, newest first.
-        self.history: tuple[Commit, ...] = ()
+        self.history: tuple[Event, ...] = ()
         snapshot = reader.snapshot(progress=progress)
         self._newest = self._with_reports(Source.read(reader, snapshot))
         self._thread = REAL.keep_running("page", self._run)
@@ -74,7 +77,7 @@ class Follower:
         return replace(self._newest, now=REAL.now())
 
     @property
-    def health_changes(self) -> tuple[HealthChange, ...]:
+    def health_changes(self) -> tuple[Event, ...]:
         # to iterate would fail if the follower's thread appended meanwhile
         return tuple(self._changes.copy())
 
@@ -140,7 +143,7 @@ class Follower:
 
     def _with_reports(self, source: Source) -> Source:
         repository, commit = self._reader.repository, source.commit
-        last = self.history[0].entry.commit if self.history else ""
+        last = self.history[0].commit if self.history else ""
         if commit != last:
             new, before = None, self.history
             if last and repository.includes(commit, last):
@@ -148,7 +151,8 @@ class Follower:
                     new = list(islice(self._reader.log(f"{last}..{commit}"), MOST_COMMITS))
             if new is None:  # the first time, or somebody has rewritten the history
                 new, before = list(islice(self._reader.log(commit), MOST_COMMITS)), ()
-            added = tuple(Commit(entry, self._reader.changed_roots(entry.commit)) for entry in new)
+            lanes = (time_line.lane_of(e, self._reader.changed_roots(e.commit)) for e in new)
+            added = tuple(map(time_line.of_commit, map(commit_data, new), lanes))
             self.history = (added + before)[:MOST_COMMITS]
         source = replace(
             source,
@@ -171,6 +175,6 @@ class Follower:
             earlier = self._words.get(name)
             if earlier and earlier != after:  # the first health that a cluster reports is no change
                 reason = source.statuses[name].health.reason
-                self._changes.append(HealthChange(REAL.now(), name, earlier, after, reason))
+                self._changes.append(time_line.of_health(name, earlier, after, reason))
         self._words = words
         return source

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
-from datetime import timedelta
+from datetime import datetime, timedelta
 from itertools import groupby, islice
 from typing import Any
 from urllib.parse import urlencode
@@ -16,14 +16,14 @@ from demandops.base import strict_yaml
 from demandops.model.config.base_model import parse_time
 from demandops.model.release import ServiceRelease
 from demandops.views import causes as cause_list
-from demandops.views.kinds import KINDS, rows_of
-from demandops.views.rows import TONES, Filter, Row, exactly, page_of, sorted_rows
-from demandops.views.source import RANKS, WORDS, HealthChange, Source
+from demandops.views.kinds import KINDS, Kind, is_released_by_demand_id, rows_of
+from demandops.views.rows import RANKS, TONES, Filter, Row, exactly, page_of, sorted_rows
+from demandops.views.source import Source
+from demandops.views.vocabulary import Json
 from demandops.views.why import (
     commits_of,
     explain,
     find,
-    is_released_by_demand_id,
     last_difference,
     release_of,
     stopped_with,
@@ -58,15 +58,7 @@ _ROWS = 100  # that a page of a list has at most
 _MOST_CAUSES = 100
 _NEWEST = 8  # changes
 _COMMITS = 20  # of one thing
-
-_THING_TONES = WORDS | {
-    **dict.fromkeys(("runs", "held", "used", "in force", "approved", "exists"), "good"),
-    "kept": "none",
-    **dict.fromkeys(("denied", "suspended", "rejected"), "bad"),
-    **dict.fromkeys(
-        ("waiting", "proposed", "overdue", "partly suspended", "not rendered yet"), "busy"
-    ),
-}
+_MOST_ROWS = 200  # of what it holds, and of what runs for it
 
 Data = dict[str, Any]
 View = Callable[["ViewRequest"], tuple[str, Data]]
@@ -108,19 +100,19 @@ class ViewRequest:
         return [row for row in rows_of(self.source, name) if self.filter.matches(row)]
 
     def events(self) -> list[Event]:
-        every = time_line.events(self.follower.history, self.follower.health_changes)
-        return [event for event in every if not self.filter or self.filter.matches(event.row())]
+        every = (*self.follower.history, *self.follower.health_changes)
+        found = (event for event in every if not self.filter or self.filter.matches(event.row()))
+        return sorted(found, key=lambda event: event.time, reverse=True)
 
     def link(self, part: Part) -> str:
         # with its own filter instead of the current one
         return self.to(part.view, **{"q": "", **part.params})
 
 
-def _overview(asked: ViewRequest) -> tuple[str, Data]:
-    source = asked.source
-    # The fleet in figures: a number and what it counts, which links to a list; and what stands out
-    # of that list, with its color.
-    demands = asked.rows("demands")
+def _figures(asked: ViewRequest, events: list[Event]) -> list[Data]:
+    # the fleet in figures: a number and what it counts, which links to a list; and what stands out
+    # of that list, with its color
+    source, demands = asked.source, asked.rows("demands")
     figures: list[Data] = []
     for name in ("releases", "connections", "demands", "requesters"):
         rows = demands if name == "demands" else asked.rows(name)
@@ -132,7 +124,7 @@ def _overview(asked: ViewRequest) -> tuple[str, Data]:
         what = Part(name.removesuffix("s") if len(rows) == 1 else name, name)
         figures.append({"count": len(rows), "what": what, "parts": parts})
     used = [row for row in asked.rows("nodes") if row.item["demands"] and row.item["type"]]
-    what = Part(f"of {len(source.config.nodes)} nodes used", "nodes")
+    what = Part(f"of {len(source.nodes)} nodes used", "nodes")
     figures.append({"count": len(used), "what": what, "parts": ()})
     proposed = len(source.proposals)
     waiting = sum(row.item["state"] == "waiting" for row in demands)
@@ -145,18 +137,23 @@ def _overview(asked: ViewRequest) -> tuple[str, Data]:
     what = Part("waiting", "proposals")
     figures.append({"count": proposed + waiting, "what": what, "parts": parts})
     moment = source.now if source.is_newest else source.entry.time
-    events = [event for event in asked.events() if event.time <= moment]
-    parts, late = [], list[int]()
+    late, figures_of = list[int](), dict[str, str]()
     for span, hours in (("hour", 1), ("day", 24)):
         recent = [event for event in events if event.time >= moment - timedelta(hours=hours)]
         booked = sum(event.word in time_line.BOOKED for event in recent)
         released = sum(event.word in time_line.RELEASED for event in recent)
-        parts.append((Part(f"{booked} booked, {released} released in the last {span}"), ""))
+        figures_of[f"{booked} booked, {released} released"] = span  # told once if they are equal
         late.append(len(recent))
     changes = "change" if late[0] == 1 else "changes"
     what = Part(f"{changes} in the last hour", "timeline", {"span": "1h"})
-    figures.append({"count": late[0], "what": what, "parts": parts})
+    parts = [(Part(f"{told} in the last {span}"), "") for told, span in figures_of.items()]
+    return [*figures, {"count": late[0], "what": what, "parts": parts}]
 
+
+def _overview(asked: ViewRequest) -> tuple[str, Data]:
+    source = asked.source
+    moment = source.now if source.is_newest else source.entry.time
+    events = [event for event in asked.events() if event.time <= moment]
     # What is not ready, with a link to the thing or to the releases that it is about.
     causes = [
         cause for cause in cause_list.causes(source) if asked.filter.matches(Row(cause.labels))
@@ -188,11 +185,10 @@ def _overview(asked: ViewRequest) -> tuple[str, Data]:
     newest = groupby(events, lambda event: event.commit or (event.summary, event.tone))
     groups = ([*same] for _, same in islice(newest, _NEWEST))
     return "overview.html.j2", {
-        "figures": figures,
+        "figures": _figures(asked, events),
         "causes": links,
         "total": len(causes),
         "applications": sorted(applications, key=lambda each: (each[2] is None, each[0])),
-        "tones": {**WORDS, **cause_list.KINDS},
         "events": [(group[0], len(group)) for group in groups],
         "overrides": source.overrides,
     }
@@ -206,35 +202,39 @@ def _list(asked: ViewRequest) -> tuple[str, Data]:
     if (key := sort.removeprefix("-")) in columns:  # `-` before a key is the reverse order
         matching = sorted_rows(matching, columns[key], now, down=sort.startswith("-"))
     shown, page, pages = page_of(matching, asked.page(), _ROWS)
-    rows: list[list[Data]] = [[] for _ in shown]
-    used: set[str] = set()  # of the columns that only some rows fill, those that a shown row fills
-    for row, cells in zip(shown, rows, strict=True):
-        for column in kind.columns:
-            if column.only_wide and column.form != "command":
-                continue
-            texts = column.texts(row.item, now)
-            time = row.item.get(column.key) if column.form == "time" else None  # instead of texts
-            tone = TONES.get(texts[0], "none") if column.form == "state" and texts else ""
-            # what is held is an application or a connection, so it has no kind
-            params = {} if column.links == "held" else {"kind": column.links}
-            parts = [
-                Part(text, "thing", params | {"name": text}) if column.links else Part(text)
-                for text in texts
-            ]
-            at = parse_time(time) if time else None
-            cells.append({"column": column, "parts": parts, "time": at, "tone": tone})
-            if parts:
-                used.add(column.key)
     return "list.html.j2", {
         "kind": kind,
-        "columns": [c for key, c in columns.items() if key in used or not shown],
-        "rows": rows,
+        "table": _table(kind, [row.item for row in shown], now),
         "total": len(every),
         "matching": len(matching),
         "sort": sort,
         "page": page,
         "pages": pages,
     }
+
+
+def _table(kind: Kind, items: Collection[Json], now: datetime) -> Data:
+    rows: list[list[Data]] = [[] for _ in items]
+    used: set[str] = set()  # of the columns that only some rows fill, those that a row fills
+    for item, cells in zip(items, rows, strict=True):
+        for column in kind.columns:
+            if column.only_wide and column.form != "command":
+                continue
+            texts = column.texts(item, now)
+            time = item.get(column.key) if column.form == "time" else None  # instead of texts
+            parts = []
+            for text in texts:
+                params = {"kind": column.links, "name": text}
+                if column.links == "held":  # an application or a connection, which may be said
+                    word, _, name = text.rpartition(" ")
+                    params = {"kind": word.replace("held for", "application"), "name": name}
+                parts.append(Part(text, "thing" if column.links else "", params))
+            at = parse_time(time) if time else None
+            cells.append({"column": column, "parts": parts, "time": at})
+            if parts:
+                used.add(column.key)
+    wanted = [c for c in kind.columns if not c.only_wide and (c.key in used or not items)]
+    return {"columns": wanted, "rows": rows}
 
 
 def _timeline(asked: ViewRequest) -> tuple[str, Data]:
@@ -270,7 +270,7 @@ def _thing(asked: ViewRequest) -> tuple[str, Data]:
     return "thing.html.j2", thing(asked.source, name, kind, health)
 
 
-def thing(source: Source, name: str, kind: str, health: Iterable[HealthChange]) -> Data:
+def thing(source: Source, name: str, kind: str, health: Iterable[Event]) -> Data:
     # what it is, why, what it holds, its time line, and what to do
     answer = explain(source, find(source, name, kind or None), _COMMITS)
     kind, name, word = answer["kind"], answer["name"], answer["state"]
@@ -278,29 +278,17 @@ def thing(source: Source, name: str, kind: str, health: Iterable[HealthChange]) 
     if runs:
         word = answer["health"] or "unknown"
     # the commits and the changes of health that touch it, newest first
-    events = [
-        {
-            "time": parse_time(commit["time"]),
-            "word": did,
-            "who": commit["author"],
-            "summary": commit["summary"],
-            "why": commit["why"] or "",
-            "decision": commit["decision"],
-            "commit": commit["commit"],
-        }
-        for did, commit in commits_of(answer)
-    ]
+    events = [time_line.of_commit(commit, word=did) for did, commit in commits_of(answer)]
     names = {name, *(release["name"] for release in answer.get("releases", ()))}
-    for event in time_line.events((), (change for change in health if change.release in names)):
-        summary = f"{event.release} {event.summary}"
-        shown = {"time": event.time, "word": event.word, "summary": summary, "who": ""}
-        events.append(shown | {"why": "", "decision": None, "commit": ""})
+    events += [change for change in health if change.release in names]
+    claims, releases = answer.get("claims", ()), answer.get("releases", ())
     data: Data = {
         "it": answer,
         "word": word,
-        "tone": _THING_TONES.get(word, "none"),
-        "tones": _THING_TONES,
-        "time_line": sorted(events, key=lambda event: event["time"], reverse=True),
+        "claims": _table(KINDS["claims"], claims[:_MOST_ROWS], source.now),
+        "releases": _table(KINDS["releases"], releases[:_MOST_ROWS], source.now),
+        "most": _MOST_ROWS,
+        "events": sorted(events, key=lambda event: event.time, reverse=True),
         "difference": last_difference(source, answer),
         "text": answer["file"] and source.reader().file_reader(source.commit)(answer["file"]),
         "released": None,

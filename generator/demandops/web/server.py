@@ -31,7 +31,7 @@ from demandops.base.quoting import escaped, lines
 from demandops.model.config.base_model import parse_time, relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
-from demandops.views.rows import exactly
+from demandops.views.rows import TONES, exactly
 from demandops.views.vocabulary import decision_text
 from demandops.web.follower import Follower
 from demandops.web.page_views import NAVIGATION, VIEWS, View, ViewRequest
@@ -95,6 +95,7 @@ class Site:
             trim_blocks=True,
             lstrip_blocks=True,
         )
+        self._templates.globals |= {"exactly": exactly, "tones": TONES, "program": __version__}
         self._templates.filters |= {
             "when": lambda at: escaped(f"{at.astimezone(timezone.utc):%Y-%m-%d %H:%M:%S UTC}"),
             # the date only if it is not today's
@@ -152,8 +153,6 @@ class Site:
                     "here": asked,
                     "now": asked.source.now,
                     "source": asked.source,
-                    "exactly": exactly,
-                    "program": __version__,
                     "has_docs": self._has_docs,
                     "version": version,
                 }

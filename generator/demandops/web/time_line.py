@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from typing import Any
 
+from demandops.base.runtime import REAL
+from demandops.model.config.base_model import parse_time
 from demandops.model.config.override import OVERRIDES_ROOT
+from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import PROPOSAL
-from demandops.views.rows import Row
-from demandops.views.source import WORDS, Commit, HealthChange
+from demandops.views.rows import TONES, Row
+from demandops.views.vocabulary import Json
 
 # The title of each lane of the time line, from top to bottom, by the lane's name.
 LANES = {
@@ -47,9 +50,11 @@ class Event:
     time: datetime
     word: str
     summary: str
-    who: str
+    who: str = ""
     commit: str = ""
-    release: str = ""
+    why: str = ""
+    decision: Json | None = None
+    release: str = ""  # whose health has changed
     tone: str = ""
 
     def row(self) -> Row:
@@ -63,26 +68,32 @@ RELEASED = frozenset({"shutdown", "release", "expire", "decommission"})
 _BY_DEMANDS = BOOKED | RELEASED | {"renew", "rollback"}
 
 
-def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Event]:
-    all_events = []
-    for commit in commits:
-        entry = commit.entry
-        word = entry.first("Operation") or "by hand"  # only generators write this trailer
-        lane = "people"
-        if word in _BY_DEMANDS or PROPOSAL in entry.trailers:
-            lane = "demands"
-        elif word == "expire-override" or (word == "by hand" and OVERRIDES_ROOT in commit.roots):
-            lane = "overrides"
-        who = ", ".join(entry.trailers.get("Requester", ())) or entry.author
-        all_events.append(Event(lane, entry.time, word, entry.summary, who, entry.commit))
-    for change in health:
-        reason = f": {change.reason}" if change.reason else ""
-        summary = f"was {change.before}, is {change.after}{reason}"
-        tone = WORDS[change.after]
-        all_events.append(
-            Event("health", change.time, change.after, summary, "", "", change.release, tone)
-        )
-    return sorted(all_events, key=lambda event: event.time, reverse=True)
+def lane_of(entry: LogEntry, roots: Collection[str]) -> str:
+    # ``roots`` are the top-level files and folders that the commit changed
+    operation = entry.first("Operation")  # only generators write this trailer
+    if operation in _BY_DEMANDS or PROPOSAL in entry.trailers:
+        return "demands"
+    if operation == "expire-override" or (not operation and OVERRIDES_ROOT in roots):
+        return "overrides"
+    return "people"
+
+
+def of_commit(commit: Json, lane: str = "", word: str = "") -> Event:
+    return Event(
+        lane,
+        parse_time(commit["time"]),
+        word or commit["operation"] or "by hand",
+        commit["summary"],
+        commit["who"],
+        commit["commit"],
+        commit["why"] or "",
+        commit["decision"],
+    )
+
+
+def of_health(release: str, before: str, after: str, reason: str) -> Event:
+    summary = f"was {before}, is {after}{f': {reason}' if reason else ''}"
+    return Event("health", REAL.now(), after, summary, release=release, tone=TONES[after])
 
 
 def within(events: Sequence[Event], span: str, now: datetime) -> tuple[str, list[Event]]:

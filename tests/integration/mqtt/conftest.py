@@ -7,7 +7,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +19,7 @@ import yaml
 
 from tests.e2e.rig import pki
 from tests.kit.limits import PATIENCE_S
+from tests.kit.rig import wait_until
 
 USER = "fleet 007"
 PASSWORD = "12345\"'{}#\\ é%"  # noqa: S105 - of a broker that lives as long as the test
@@ -60,8 +60,7 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
         [_program("mosquitto_passwd"), "-c", "-b", str(passwords), USER, PASSWORD],
         check=True,
     )
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+    with socket.create_server(("127.0.0.1", 0)) as probe:
         port = int(probe.getsockname()[1])
     configuration = folder / "mosquitto.conf"
     configuration.write_text(
@@ -74,23 +73,18 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
         process = subprocess.Popen(
             [_program("mosquitto"), "-c", str(configuration)], stdout=out, stderr=out
         )
+
+    def listens() -> bool:
+        assert process.poll() is None, log.read_text()
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
     try:
-        _wait_until_it_listens(process, port, log)
+        wait_until(listens, "mosquitto listens")
         yield Broker(port, keys.authority)
     finally:
         process.terminate()
         process.wait(PATIENCE_S)
-
-
-def _wait_until_it_listens(process: subprocess.Popen[bytes], port: int, log: Path) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while time.monotonic() < until:
-        assert process.poll() is None, log.read_text()
-        with socket.socket() as probe:
-            if probe.connect_ex(("127.0.0.1", port)) == 0:
-                return
-        time.sleep(0.05)
-    raise AssertionError(f"mosquitto does not listen: {log.read_text()}")
 
 
 class Pod:
@@ -174,7 +168,7 @@ class Client:
         self._client.on_connect = self._connected
         self._client.connect(parameters["broker.host"], parameters["broker.port"])
         self._client.loop_start()
-        self.wait(lambda: bool(self.reason))
+        wait_until(lambda: bool(self.reason), "the broker answers")
 
     def _connected(self, client: mqtt.Client, _: object, __: object, reason: Any, ___: Any) -> None:
         topics = self.parameters.get("bridge.mqtt2ros.mqtt_topics", [])
@@ -201,14 +195,12 @@ class Client:
     def ready(self) -> None:
         """Wait until the broker has confirmed every subscription."""
         topics = self.parameters.get("bridge.mqtt2ros.mqtt_topics", [])
-        self.wait(lambda: len(self.acknowledged) == len(topics))
+        wait_until(lambda: len(self.acknowledged) == len(topics), "all is subscribed to")
 
-    def wait(self, done: Any) -> None:
-        """Wait until `done` returns a true value; fail at the deadline."""
-        until = time.monotonic() + PATIENCE_S
-        while not done():
-            assert time.monotonic() < until, (self.reason, self.arrived)
-            time.sleep(0.01)
+    def named(self) -> list[tuple[str, bytes, int, bool]]:
+        """Return the messages that arrived, by their ROS topics."""
+        name = "bridge.mqtt2ros.{}.ros_topic"
+        return sorted((self.parameters[name.format(topic)], *more) for topic, *more in self.arrived)
 
     def close(self) -> None:
         self._client.disconnect()

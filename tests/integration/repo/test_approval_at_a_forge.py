@@ -17,10 +17,9 @@ from demandops.serve import proposal
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
-from tests.kit.generator import Proposed
 from tests.kit.http import Answer, Call, serving
 from tests.kit.repo import Person, branches, git
-from tests.kit.rig import goal
+from tests.kit.rig import Proposed, goal
 
 TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
 

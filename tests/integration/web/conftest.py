@@ -21,9 +21,9 @@ from demandops.web.page_views import LISTS
 from demandops.web.server import Site
 from starlette.testclient import TestClient
 
+from tests.integration.web.html import Page
 from tests.kit import goals
-from tests.kit.generator import book, running, wait_until
-from tests.kit.html import Page
+from tests.kit.rig import book, running, wait_until
 
 VIEWS = ("/", "/map", "/services", "/timeline", *(f"/{name}" for name in LISTS))
 DENY = """apiVersion: demandops/v1

@@ -16,20 +16,19 @@ import yaml
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.views.kinds import rows_of
-from demandops.views.rows import Filter
-from demandops.web import fleet_map, page_views
+from demandops.web import page_views
 from demandops.web.follower import Follower
 from demandops.web.page_views import LISTS
 from demandops.web.server import Site
 from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import DENY, VIEWS, Look, causes
+from tests.integration.web.html import Page
 from tests.kit import goals
 from tests.kit.config import override
-from tests.kit.generator import Proposed, book, running, wait_until
-from tests.kit.html import Page
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, Person, away, git
+from tests.kit.rig import Proposed, book, running, wait_until
 
 LINK = {"id": "vehicle02/cloud", "type": "mqtt", "source": "vehicle02", "target": "cloud"}
 LINK |= {"topics": [{"source": "/t"}]}
@@ -44,16 +43,24 @@ def overridden(generator: Generator, overrides: int = 1) -> None:
     )
 
 
-def broken(generator: Generator) -> None:
-    """Wait until the generator reports what a person broke."""
-    generator.fetch_now()
-    wait_until(lambda: generator.snapshot.problems, "the generator reports it")
-
-
-def test_a_denied_connection_names_the_override_its_owner_and_since_when(
+def test_a_denied_connection_is_told_everywhere(
     booked: Generator, person: Person, follower: Follower, look: Look
 ) -> None:
+    def figures(**asked: str) -> list[str]:
+        return look("/", **asked).texts("li")[:7]
+
+    assert figures() == [
+        "9 releases 9 unknown",
+        "3 connections 3 unknown",
+        "2 demands 2 unknown",
+        "3 requesters 3 unknown",
+        "4 of 7 nodes used",
+        "0 waiting",
+        "2 changes in the last hour 2 booked, 0 released in the last day",
+    ]
+    book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
     person.override(roadworks=DENY)
+    person.change({"README.md": "hello"}, "Greet")
     overridden(booked)
     page = look("/")
     assert page.texts("h1") == ["1 of 1 application is not ready"]
@@ -65,9 +72,32 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     changed = follower.newest.last_change("overrides/roadworks.yaml")
     assert changed and cause.since == changed.time
     assert "vehicle01/edge is booked, but overrides/roadworks.yaml denies it" in page.text
+    assert "1 override: 1 in force" in page.text
     assert "vehicle01/edge" not in look("/connections").text
     for path in VIEWS:
         look(path)
+    told = figures(q="vehicle01")
+    assert told[1:3] == ["1 connection 1 unknown", "1 demand 1 unknown"]
+    assert "1 booked, 0 released in the last day" in told[-1]
+    assert "1 booked, 1 released" not in told[-1] and "1 released in the last day" in figures()[-1]
+    page = look("/release", name=DETECTION)
+    assert "It is gone since" in page.text and "stopped" in page.texts("td")
+    assert len(look("/timeline", lane="demands").texts("tr")[1:]) == 3
+    assert "A person's change" in look("/timeline", lane="overrides").text
+    assert "Greet" in look("/timeline", lane="people").text
+    assert len(look("/timeline", q="who:vehicle01").texts("tr")[1:]) == 1
+
+
+def test_an_application_that_others_demand_too_runs_on_without_a_suspended_requester(
+    booked: Generator, person: Person, follower: Follower, look: Look
+) -> None:
+    person.override(workshop=override({"requesters": ["vehicle00"]}, deny=True))
+    overridden(booked)
+    assert look("/").texts("h1") == ["1 thing needs attention"]
+    (cause,) = causes(follower.newest)
+    assert (cause.kind, cause.applications) == ("suspended", ())
+    page = look("/thing", kind="requester", name="vehicle00")
+    assert "kind=override&name=workshop" in page.link("workshop")
 
 
 def test_an_override_that_no_generator_carried_out_yet_is_told(bare: Path, state: GitRepo) -> None:
@@ -82,25 +112,23 @@ def test_an_override_that_no_generator_carried_out_yet_is_told(bare: Path, state
     assert "wait for a generator to carry out a person&#39;s commit" in first.text
 
 
-def test_an_invalid_file_names_who_wrote_it(
-    booked: Generator, person: Person, follower: Follower, look: Look
-) -> None:
-    person.change({"registry/images.yaml": "images: [\n"}, "Break it")
-    broken(booked)
-    page = look("/")
-    (cause,) = causes(follower.newest)
-    assert cause.kind == "invalid"
-    assert cause.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
-    assert cause.command.startswith("git show ")
-    assert "stays in effect" in page.text and "git revert --no-edit -m 1 " in page.text
-
-
-def test_too_many_causes_are_counted(
-    booked: Generator, person: Person, look: Look, monkeypatch: pytest.MonkeyPatch
+def test_an_invalid_file_names_who_wrote_it_and_too_many_causes_are_counted(
+    booked: Generator,
+    person: Person,
+    follower: Follower,
+    look: Look,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     person.change({"registry/images.yaml": "images: [\n", "registry/charts.yaml": "charts: [\n"})
-    broken(booked)
-    assert "more causes" not in look("/").text
+    booked.fetch_now()
+    wait_until(lambda: booked.snapshot.problems, "the generator reports it")
+    page = look("/")
+    for cause in causes(follower.newest):
+        assert cause.kind == "invalid"
+        assert cause.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
+        assert cause.command.startswith("git show ")
+    assert "stays in effect" in page.text and "git revert --no-edit -m 1 " in page.text
+    assert "more causes" not in page.text
     monkeypatch.setattr(page_views, "_MOST_CAUSES", 1)
     page = look("/")
     assert len(page.texts("h3")) == 1 and "and 1 more causes; filter to see them" in page.text
@@ -128,17 +156,19 @@ def _approved(generator: Generator) -> bool:
     return generator.snapshot.state.config.domains["perception"].approval == "none"
 
 
-def test_a_lease_is_listed_with_its_end(booked: Generator, look: Look) -> None:
-    book(booked, goals.put("short", "vehicle02", applications=[], connections=[LINK], lease="10m"))
+def test_a_lease_is_listed_and_the_consequence_of_its_release_is_what_follows(
+    booked: Generator, look: Look, state: GitRepo
+) -> None:
+    book(booked, goals.put("mine", "vehicle02", applications=[], connections=[LINK], lease="10m"))
     (row,) = look("/leases").texts("tr")[1:]
-    assert re.match(r"short in [0-9m]+s? vehicle02 10m vehicle02/cloud", row)
-
-
-def test_a_release_that_stopped_is_still_explained(booked: Generator, look: Look) -> None:
-    book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
-    page = look("/release", name=DETECTION)
-    assert "It is gone since" in page.text and "stopped" in page.texts("td")
-    assert look("/release", 404, name="never").text.startswith("Nothing to show")
+    assert re.match(r"mine in [0-9m]+s? vehicle02 10m vehicle02/cloud", row)
+    page = look("/demand", id="mine")
+    told = {e.text.strip() for e in page.all("a") if "li" in e.inside and "main" in e.inside}
+    (command,) = [e.text for e in page.all("pre")]
+    before = set(state.manifests())
+    book(booked, yaml.safe_load(command.partition("<<'END'\n")[2].removesuffix("END")))
+    gone = {Path(path).stem for path in before - set(state.manifests())}
+    assert gone == told and len(gone) == 2
 
 
 @pytest.mark.parametrize(
@@ -177,32 +207,6 @@ def test_an_override_that_another_holds_back_is_told(
     assert "held back" in look("/overrides").text
 
 
-def test_the_consequence_of_a_release_is_what_follows(
-    booked: Generator, look: Look, state: GitRepo
-) -> None:
-    book(booked, goals.put("mine", "vehicle02", applications=[], connections=[LINK]))
-    page = look("/demand", id="mine")
-    told = {e.text.strip() for e in page.all("a") if "li" in e.inside and "main" in e.inside}
-    (command,) = [e.text for e in page.all("pre")]
-    file = command.partition("<<'END'\n")[2].removesuffix("END")
-    before = set(state.manifests())
-    book(booked, yaml.safe_load(file))
-    gone = {Path(path).stem for path in before - set(state.manifests())}
-    assert gone == told and len(gone) == 2
-
-
-def test_the_time_line_has_lanes_for_demands_overrides_and_people(
-    booked: Generator, person: Person, look: Look
-) -> None:
-    person.override(roadworks=DENY)
-    person.change({"README.md": "hello"}, "Greet")
-    overridden(booked)
-    assert len(look("/timeline", lane="demands").texts("tr")[1:]) == 2
-    assert "A person's change" in look("/timeline", lane="overrides").text
-    assert "Greet" in look("/timeline", lane="people").text
-    assert len(look("/timeline", q="who:vehicle01").texts("tr")[1:]) == 1
-
-
 def test_a_span_of_the_time_line_lists_only_its_events(booked: Generator, look: Look) -> None:
     def commits(page: Page) -> list[str]:
         return [text.split()[-1] for text in page.texts("tr")[1:]]
@@ -218,67 +222,7 @@ def test_a_span_of_the_time_line_lists_only_its_events(booked: Generator, look: 
     assert len(commits(look("/timeline", span="7d", q="who:vehicle01"))) == 1
 
 
-def test_the_overview_has_the_fleet_in_figures(
-    booked: Generator, person: Person, look: Look
-) -> None:
-    def figures(**asked: str) -> list[str]:
-        return look("/", **asked).texts("li")[:7]
-
-    assert figures() == [
-        "9 releases 9 unknown",
-        "3 connections 3 unknown",
-        "2 demands 2 unknown",
-        "3 requesters 3 unknown",
-        "4 of 7 nodes used",
-        "0 waiting",
-        "2 changes in the last hour 2 booked, 0 released in the last hour "
-        "2 booked, 0 released in the last day",
-    ]
-    book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
-    person.override(roadworks=DENY)
-    overridden(booked)
-    told = figures(q="vehicle01")
-    assert told[1:3] == ["1 connection 1 unknown", "1 demand 1 unknown"]
-    assert "1 booked, 0 released in the last day" in told[-1]
-    assert "1 booked, 1 released" not in told[-1] and "1 released in the last day" in figures()[-1]
-    page = look("/")
-    assert "1 override: 1 in force" in page.text
-
-
-def test_nodes_are_drawn_where_they_are_and_cover_no_other(
-    booked: Generator, person: Person, follower: Follower
-) -> None:
-    path = "inventory/nodes.yaml"
-    nodes = yaml.safe_load(person.read(path))
-    for number, node in enumerate(nodes["nodes"]):
-        node["position"] = {"x": 10.0 * (number % 3), "y": float(number)}
-    person.change({path: yaml.safe_dump(nodes)})
-    wait_until(
-        lambda: all(node.position for node in follower.newest.config.nodes.values()),
-        "the nodes have positions",
-    )
-    drawn = fleet_map.picture(follower.newest, Filter(""), "")
-    assert (drawn["layout"], drawn["layouts"]) == ("place", ("cluster", "place"))
-    for layout in drawn["layouts"]:
-        for drawing in fleet_map.picture(follower.newest, Filter(""), layout)["drawings"]:
-            for card in drawing.cards:
-                assert card.x >= 0 and card.x + card.width <= drawing.width
-                assert not [o for o in drawing.cards if o is not card and _cover(card, o)]
-    by_id = {card.label: card for card in drawn["drawings"][0].cards}
-    ids = [node["id"] for node in nodes["nodes"]]
-    assert by_id[ids[0]].x < by_id[ids[1]].x < by_id[ids[2]].x
-    assert by_id[ids[-1]].y < by_id[ids[0]].y
-
-
-def _cover(one: fleet_map.Card, other: fleet_map.Card) -> bool:
-    beside = one.x + one.width <= other.x or other.x + other.width <= one.x
-    return not (beside or one.y + one.height <= other.y or other.y + other.height <= one.y)
-
-
-@pytest.mark.parametrize(
-    "stop", [pytest.param(signal.SIGINT, marks=pytest.mark.nightly), signal.SIGTERM]
-)
-def test_the_command_serves_the_page_until_it_is_stopped(bare: Path, stop: int) -> None:
+def test_the_command_serves_the_page_until_it_is_stopped(bare: Path) -> None:
     command = [sys.executable, "-m", "demandops.cli.main", "web"]
     process = subprocess.Popen(
         [*command, "--state-repo", str(bare), "--listen", "127.0.0.1:0"],
@@ -290,7 +234,7 @@ def test_the_command_serves_the_page_until_it_is_stopped(bare: Path, stop: int) 
     url = process.stdout.readline().strip()
     with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:  # noqa: S310 - the page
         assert b"Nothing is demanded" in answer.read()
-    process.send_signal(stop)
+    process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out, err) == (0, "", "stopped\n")
 

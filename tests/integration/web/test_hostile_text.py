@@ -12,11 +12,11 @@ from demandops.serve.generator import Generator
 from demandops.web.follower import Follower
 
 from tests.integration.web.conftest import VIEWS, Look
+from tests.integration.web.html import Page
 from tests.kit import goals
 from tests.kit.config import override
-from tests.kit.generator import book, wait_until
-from tests.kit.html import Page
 from tests.kit.repo import GitRepo, Person, git
+from tests.kit.rig import book, wait_until
 
 HOSTILE = "<script>alert(1)</script>\"'><img src=x onerror=alert(1)>{{'zz'*2}}"
 HIDDEN = "\u202e"

@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from datetime import timedelta
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import pytest
 from demandops.cluster.health import Health
 from demandops.cluster.rollouts import OldBootstrap, Orphan, ReleaseStatus
+from demandops.model.config.inventory import Position
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
@@ -56,12 +58,6 @@ def changed(follower: Follower, **fields: Any) -> Source:
     return replace(shown, snapshot=snapshot, problems=(), derived={})
 
 
-def test_without_clusters_the_page_says_what_it_cannot_know(look: Look) -> None:
-    page = look("/")
-    assert page.texts("h1") == ["Nothing in the state repo keeps an application from being ready"]
-    assert "does not watch the clusters" in page.text
-
-
 @pytest.mark.parametrize(
     ("reason", "who"),
     [
@@ -104,18 +100,21 @@ def test_a_failing_release_without_images_in_the_registry_names_its_maintainer(
     assert found[0].startswith("the maintainer of appdefs/object-detection-fusion")
 
 
-def test_not_everything_is_ready_while_a_cluster_is_not_watched(
+def test_what_is_not_known_is_not_called_ready(
     shown: Shown, follower: Follower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source = with_health(follower)
+    source = follower.newest
     # the follower's thread may set its own newest source at any time
     monkeypatch.setattr(Follower, "newest", property(lambda self: source))
+    unknown = ["Nothing in the state repo keeps an application from being ready"]
+    page = shown.look("/")
+    assert page.texts("h1") == unknown and "does not watch the clusters" in page.text
+    source = with_health(follower)
     assert shown.look("/").texts("h1") == ["Everything is ready"]
     assert shown.look("/", q="vehicle00").texts("h1") == ["Everything that matches is ready"]
     source = replace(source, watched=frozenset({"other"}))
     page = shown.look("/")
-    assert page.texts("h1") == ["Nothing in the state repo keeps an application from being ready"]
-    assert "Whether pods run on c-its is unknown" in page.text
+    assert page.texts("h1") == unknown and "Whether pods run on c-its is unknown" in page.text
 
 
 def test_each_kind_of_thing_has_a_page(look: Look) -> None:
@@ -132,11 +131,6 @@ def test_each_kind_of_thing_has_a_page(look: Look) -> None:
         assert page.texts("h1")[0].startswith(f"{kind.capitalize()} {name} ")
         assert told in page.text, kind
         assert page.texts("h2")[-1] == "Time line"
-
-
-def test_an_unknown_release_is_told(look: Look) -> None:
-    page = look("/release", status=404, name="od-nowhere")
-    assert "no release is called 'od-nowhere'" in page.text
 
 
 def test_an_old_bootstrap_file_and_an_object_of_no_release_are_causes(follower: Follower) -> None:
@@ -196,6 +190,8 @@ def test_a_release_is_explained(look: Look, state: GitRepo) -> None:
     assert shown == rendered
     assert difference.splitlines()[1:] == [f"+{line}" for line in rendered.splitlines()]
     assert "started" in page.texts("td")
+    page = look("/release", status=404, name="od-nowhere")
+    assert "no release is called 'od-nowhere'" in page.text
 
 
 def test_the_page_shows_the_claims_at_an_earlier_commit(look: Look, state: GitRepo) -> None:
@@ -229,6 +225,28 @@ def fleet_of(follower: Follower, vehicles: int, edges: int = 1) -> Source:
             id = f"far-{type}{number}"
             more[id] = model.model_copy(update={"id": id, "type": type})
     return changed(follower, config=replace(config, nodes=more))
+
+
+def test_nodes_are_drawn_where_they_are_and_cover_no_other(follower: Follower) -> None:
+    newest, nodes = follower.newest, {}
+    for number, node in enumerate(newest.config.nodes.values()):
+        place = {"x": 10.0 * (number % 3), "y": float(number)}
+        nodes[node.id] = node.model_copy(update={"position": Position.model_validate(place)})
+    source = changed(follower, config=replace(newest.config, nodes=nodes))
+    drawn = fleet_map.picture(source, Filter(""), "")
+    assert (drawn["layout"], drawn["layouts"]) == ("place", ("cluster", "place"))
+    for layout in drawn["layouts"]:
+        for drawing in fleet_map.picture(source, Filter(""), layout)["drawings"]:
+            assert all(0 <= card.x <= drawing.width - card.width for card in drawing.cards)
+            assert not [pair for pair in combinations(drawing.cards, 2) if cover(*pair)]
+    cards = {card.label: card for card in drawn["drawings"][0].cards}
+    first, second, third, *_, last = (cards[id] for id in nodes)
+    assert first.x < second.x < third.x and last.y < first.y
+
+
+def cover(one: fleet_map.Card, other: fleet_map.Card) -> bool:
+    beside = one.x + one.width <= other.x or other.x + other.width <= one.x
+    return not (beside or one.y + one.height <= other.y or other.y + other.height <= one.y)
 
 
 def test_many_nodes_are_drawn_as_stacks_that_a_filter_opens(follower: Follower) -> None:
@@ -298,15 +316,8 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
 
 def test_the_time_line_fills_the_drawing(shown: Shown) -> None:
     follower = shown.follower
-    events = time_line.events(follower.history, follower.health_changes)
+    events = follower.history
     strip = time_line.strip(events, events[0].time, "all", None)
     template = (Path(time_line.__file__).parent / "pages" / "timeline.html.j2").read_text()
     width = int(re.findall(r'x2="(\d+)"', template)[0])
     assert max(dot["x"] for dot in strip["dots"]) > 0.9 * width
-
-
-def test_no_name_of_a_page_module_is_bound_twice() -> None:
-    """Merged sections had the same name for two limits, and the later one replaced the other."""
-    for file in Path(time_line.__file__).parent.glob("*.py"):
-        names = re.findall(r"^(_?[A-Z][A-Z_]+)(?:, _?[A-Z_]+)* = ", file.read_text(), re.MULTILINE)
-        assert len(names) == len({*names}), file

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -23,9 +22,8 @@ from demandops.model.ledger.ledger import changes_on
 from tests.kit.config import skeleton
 from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.goals import connection, goal
-from tests.kit.memory import MemoryRepo, unread_fields
+from tests.kit.memory import MemoryRepo
 
-KINDS = ("mqtt", "zenoh", "ros")
 NODES: dict[str, dict[str, Any]] = {"vehicle00": SPEAKS | TYPED, "edge": REACHABLE | WAN}
 
 
@@ -105,30 +103,17 @@ def test_no_two_connections_share_an_mqtt_topic_or_a_client_id() -> None:
     assert all(re.fullmatch(r"[a-z0-9-]+(/[A-Za-z0-9_]+)+", topic) for topic in topics)
 
 
-def test_the_host_of_a_broker_becomes_part_of_a_url() -> None:
-    brokers = skeleton()["inventory/brokers.yaml"]
-    brokers = brokers.replace("host: service-mqtt-broker-edge.default.svc", 'host: "2001:db8::1"')
-    repo = MemoryRepo({"inventory/brokers.yaml": brokers})
-    repo.send(goal([], [connection()]))
-    for whole in configurations(repo).values():
-        broker = whole["/**/*"]["ros__parameters"]["broker"]
-        assert broker == {"host": "[2001:db8::1]", "port": 1993}
-
-
-def test_tls_without_a_secret_trusts_what_the_image_trusts() -> None:
+def test_what_is_not_configured_is_left_out_and_an_ipv6_host_becomes_part_of_a_url() -> None:
     brokers = skeleton()["inventory/brokers.yaml"] + "    tls: {}\n"
-    repo = MemoryRepo({"inventory/brokers.yaml": brokers})
-    repo.send(routes(demand("mqtt")))
+    brokers = brokers.replace("host: service-mqtt-broker-edge.default.svc", 'host: "2001:db8::1"')
+    repo = MemoryRepo({"inventory/brokers.yaml": brokers, "registry/clients.yaml": None})
+    repo.send(goal([], [connection()]))
     for name, whole in configurations(repo).items():
-        assert whole["/**/*"]["ros__parameters"]["broker"]["tls"] == {"enabled": True}
-        assert [volume["name"] for volume in pods(repo)[name]["spec"]["volumes"]] == ["config"]
-
-
-def test_without_settings_a_client_runs_what_the_image_has() -> None:
-    repo = MemoryRepo({"registry/clients.yaml": None})
-    repo.send(routes(demand("mqtt")))
-    (container,) = pods(repo)["mqtt-c-source"]["spec"]["containers"]
-    assert container["args"][3] == "standalone.launch.xml"
+        broker = whole["/**/*"]["ros__parameters"]["broker"]
+        assert broker == {"host": "[2001:db8::1]", "port": 1993, "tls": {"enabled": True}}
+        spec = pods(repo)[name]["spec"]
+        assert [volume["name"] for volume in spec["volumes"]] == ["config"], "no CA of its own"
+        assert spec["containers"][0]["args"][3] == "standalone.launch.xml", "as the image has it"
 
 
 @pytest.mark.parametrize(
@@ -141,14 +126,7 @@ def test_without_settings_a_client_runs_what_the_image_has() -> None:
         ("ros", None, {"vehicle00": {}}, "connections", "'c': the message type of '/a' is not"),
         ("zenoh", None, {"images": ""}, "images", "'zenoh-bridge' is in use, but not in registry"),
     ],
-    ids=[
-        "another option",
-        "another name",
-        "no bridge",
-        "no address",
-        "no message type",
-        "no image",
-    ],
+    ids=["an option", "a name", "no bridge", "no address", "no message type", "no image"],
 )
 def test_what_people_change_in_git_so_that_the_type_cannot_carry_it_is_told(
     kind: str, route: Route | None, lost: dict[str, Any], field: str, told: str
@@ -161,25 +139,3 @@ def test_what_people_change_in_git_so_that_the_type_cannot_carry_it_is_told(
         rendered_files(replace(state(**(NODES | lost)), ledger=ledger))
     found = refused.value.faults[0]
     assert (found.field, found.message[: len(told)]) == (field, told)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_schema_knows_no_field_more_than_a_configuration_has_anywhere(kind: str) -> None:
-    repo = booked(demand(kind))
-    for path in [path for path in repo.files if path.rpartition("/")[2].startswith(f"{kind}-")]:
-        map, *others = yaml.safe_load_all(repo.files[path])
-        name = next(iter(map["data"]))
-        whole = yaml.safe_load(map["data"][name])
-        for spot in mappings(whole):
-            spot["surplus"] = 1
-            map["data"][name] = yaml.safe_dump(whole)
-            assert unread_fields(path, yaml.safe_dump_all([map, *others]))
-            del spot["surplus"]
-
-
-def mappings(value: Any) -> Iterator[dict[str, Any]]:
-    if isinstance(value, dict):
-        yield value
-    for item in value.values() if isinstance(value, dict) else value:
-        if isinstance(item, dict | list):
-            yield from mappings(item)

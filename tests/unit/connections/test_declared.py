@@ -30,6 +30,7 @@ def leaves(schema: Any, definitions: Any, path: str = "") -> Iterator[tuple[str,
         for item in items if isinstance(items, list) else [items]:
             yield from leaves(item, definitions, f"{path}[]")
     elif schema.get("type") == "object":
+        assert schema["additionalProperties"] is False, path
         patterns = [("{}", part) for part in schema.get("patternProperties", {}).values()]
         for name, part in (*schema.get("properties", {}).items(), *patterns):
             yield from leaves(part, definitions, f"{path}.{name}" if path else name)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
-import pytest
 import yaml
-from demandops.base.errors import InvalidInput, Refused
+from demandops.base.errors import Refused
 from demandops.decide.bookkeeping import bookkeeping
 from demandops.decide.state import rendered_files
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
@@ -85,69 +83,3 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
         for entry in entries["services"].values():
             assert (entry["service"], entry["node"]) != ("object-detection", "cloud")
         assert "v2/edge" not in entries["connections"]
-
-
-def after(books: MemoryRepo, changed: dict[str, str | None]) -> dict[str, str]:
-    """Return the files when the configuration of a repo with releases is changed."""
-    state = replace(MemoryRepo(changed).state, ledger=books.state.ledger)
-    return rendered_files(state, books.files)
-
-
-DETECTION = "clusters/c-its/perception/edge/od-edge-vehicle00.yaml"
-HOLD = {"select": [{"services": ["object-detection"]}], "hold": True}
-
-
-@pytest.mark.parametrize(("priority", "changes"), [(1, True), (-1, False)])
-def test_only_an_override_of_higher_priority_than_a_hold_changes_the_held_release(
-    priority: int, changes: bool
-) -> None:
-    books = MemoryRepo()
-    books.send(goal([application()]))
-    more = {"select": [{"nodes": ["edge"]}], "replicas": 4, "priority": priority}
-    held = after(books, files(held=HOLD, more=more))[DETECTION]
-    assert (yaml.safe_load(held) != yaml.safe_load(books.files[DETECTION])) is changes
-
-
-@pytest.mark.parametrize(("select", "fields"), TABLES["denied"], ids=str)
-def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
-    select: dict[str, Any], fields: list[str]
-) -> None:
-    expires = "2090-01-01T00:00:00Z"
-    books = MemoryRepo(files(tested={"select": [select], "deny": True, "expires": expires}))
-    told = (
-        f"is denied by overrides/tested.yaml until {expires}: why; ask the override's owner, petra"
-    )
-    found = books.faults(goal([application()], [connection()]))
-    assert [one.partition(", or")[0] for one in found] == [f"{field}: {told}" for field in fields]
-
-
-def test_a_refusal_names_the_override_that_breaks_the_demand() -> None:
-    """``check`` tries a patch only with an invented demand, so ``check`` can miss a mistake."""
-    fields = {"select": [{"services": ["object-detection"]}], "values": {"replicas": {"x": 1}}}
-    books = MemoryRepo(files(tested=fields))
-    with pytest.raises(InvalidInput) as refusal:
-        books.send(goal([application()]))
-    (found,) = refusal.value.faults
-    assert (found.file, found.field) == ("overrides/tested.yaml", "values.replicas")
-    assert "fix the override or appdefs/" in found.message
-
-
-REGISTRY = """\
-apiVersion: demandops/v1
-kind: Charts
-charts:
-  object-detection: {oci: "oci://registry.example/charts/object-detection", version: %s}
-  object-fusion: {http: "https://charts.example/perception", version: %s}
-"""
-
-
-@pytest.mark.parametrize("held", [True, False])
-def test_a_held_release_keeps_its_chart_when_the_registry_moves_on(held: bool) -> None:
-    books = MemoryRepo({"registry/charts.yaml": REGISTRY % ("1.0.0", "2.0.0")})
-    books.send(goal([application()]))
-    newer = {"registry/charts.yaml": REGISTRY % ("1.1.0", "2.1.0")}
-    found = after(books, newer | (files(held=HOLD) if held else {}))
-    charts = "clusters/c-its/perception/_charts/object-detection"
-    assert (f"{charts}-1.0.0.yaml" in found) is held
-    assert f"{charts}-1.1.0.yaml" in found
-    assert ("object-detection-1.0.0" in found[DETECTION]) is held

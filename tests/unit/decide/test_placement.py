@@ -9,17 +9,15 @@ from dataclasses import replace
 from random import Random
 from typing import Any
 
-import pytest
 from demandops.base.errors import Refused
 from demandops.decide.decision import Decision
 from demandops.model.config.inventory import Node
 from demandops.model.config.load import load
-from demandops.repo.history import commit_message
 from hypothesis import given
 
 from tests.kit.chance import chances, examples
 from tests.kit.config import state_of
-from tests.kit.memory import NOW, MemoryRepo
+from tests.kit.memory import MemoryRepo
 from tests.scenarios.running import configuration
 
 SOURCES = ("vehicle0", "vehicle1")
@@ -88,7 +86,7 @@ def requirement(random: Random) -> dict[str, Any]:
 
 
 def has(node: Node, place: dict[str, Any]) -> bool:
-    labels = {f"{key}={value}" for key, value in node.labels().items()}
+    labels = {f"{key}={value}" for key, value in node.labels.items()}
     return (
         node.type == place["role"]
         and {*place["labels"]} <= labels
@@ -134,59 +132,3 @@ def test_it_is_a_node_that_fits_the_same_in_any_order_and_stays(random: Random) 
         weaker = goal | {"applications": [app | {"place": {"role": place["role"]}}]}
         assert isinstance(shuffled(repo, random).take(weaker), Decision)
         assert repo.send(weaker).state.ledger.application(id).node == booked.node
-
-
-def at(x: int, y: int = 0, **more: Any) -> dict[str, Any]:
-    return {"position": {"x": x, "y": y}, "capabilities": ["gpu"]} | more
-
-
-GPU = {"place": {"capabilities": ["gpu"]}}
-ANY = asking({"capabilities": ["gpu"]})
-
-
-@pytest.mark.parametrize(
-    ("fusion", "sent", "edge", "cloud", "says"),
-    [
-        ({}, asking({"role": "cloud"}), {}, {}, "'cloud', the only node that fits"),
-        ({}, ANY, at(9), {"capabilities": ["gpu"]}, "'edge', the nearest to its sources among 2"),
-        (
-            {}, ANY | {"positions": [{"node": "cloud", "x": 3, "y": 4}]}, at(9),
-            {"capabilities": ["gpu"]}, "'cloud', the nearest to its sources among 2 nodes that fit",
-        ),
-        (GPU, asking({}, node="edge"), at(9), at(0), "'edge', the node of its application among 2"),
-        (GPU, asking({}, node="edge"), {}, at(0), "'cloud', the only node that fits"),
-    ],
-)  # fmt: skip
-def test_the_answer_and_the_commit_say_which_node_and_why(
-    fusion: dict[str, Any], sent: Any, edge: dict[str, Any], cloud: dict[str, Any], says: str
-) -> None:
-    source = {"id": SOURCES[0], "type": "vehicle", "position": {"x": 0, "y": 0}}
-    nodes = [{"id": "edge"} | edge, {"id": "cloud", "type": "cloud"} | cloud]
-    services = {"services": {"object-fusion": fusion}}
-    repo = repo_with([source, *nodes], **{"appdefs/object-detection-fusion/appdef.yaml": services})
-    decision = repo.send(sent)
-    what = "service 'object-fusion' of " if fusion else ""
-    what += "application 'app' is placed on "
-    (placed,) = decision.placed
-    assert placed.startswith(what + says)
-    message = commit_message.of_decision(decision, "op", NOW)
-    assert f" {what[0].upper()}{what[1:]}{says}" in message
-    again = repo.send(sent)
-    assert again.outcome == "unchanged"
-    assert again.placed == (f"{what}{says.partition(',')[0]}, where it is booked already",)
-
-
-def test_a_service_that_runs_for_a_topic_already_is_shared_there() -> None:
-    vehicle, edge = {"id": SOURCES[0], "type": "vehicle"}, {"id": "edge"}
-    nodes = [vehicle, edge, *({"id": id, "capabilities": ["gpu"]} for id in ("a", "b"))]
-    place = {"services": {"object-detection": {"place": {"capabilities": ["gpu"]}}}}
-    repo = repo_with(nodes, **{"appdefs/object-detection-fusion/appdef.yaml": place})
-    inputs = {"point_cloud": [{"topic": "/points", "source": SOURCES[0]}]}
-    told = []
-    for id in ("first", "second"):
-        sent = asking({}, id, id, node="edge", inputs=inputs, connect="none")
-        told += repo.send(sent).placed
-    place_of = "service 'object-detection' of application '{}' is placed on 'a', {}"
-    why = "the one with the fewest applications among 2 nodes that fit"
-    shared = "where the service already runs for this topic"
-    assert told == [place_of.format("first", why), place_of.format("second", shared)]

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import yaml
 from demandops.decide.booking import Restoration
-from demandops.model.demand.demand import Decommission
 from demandops.model.ledger import records
 from demandops.model.ledger.records import in_turn
 
@@ -48,13 +47,6 @@ def full_repo() -> MemoryRepo:
         taken = repo.send(put(name) | {"requesters": [who]})
         assert taken.outcome == "waiting" and taken.lease_s is None
     return repo
-
-
-def test_a_decommissioned_requester_waits_no_longer() -> None:
-    repo = full_repo()
-    decision = repo.send(Decommission(id="w", kinds=frozenset({"requester"})))
-    assert (decision.outcome, waits(repo)) == ("released", ["a"])
-    assert records.waiting_path("b") not in repo.files
 
 
 def test_a_rollback_leaves_what_waits() -> None:

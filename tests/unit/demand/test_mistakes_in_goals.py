@@ -7,12 +7,12 @@ from collections.abc import Callable
 import pytest
 from demandops.base.errors import Refused
 
-from tests.kit import mutations, rich
+from tests.kit import forms
+from tests.kit.forms import Form
 from tests.kit.goals import Goal
 from tests.kit.memory import MemoryRepo
-from tests.kit.mutations import Form
 
-REFERENCE, OWN = (Form(model.model_json_schema()) for model in rich.GOAL_MODELS)
+REFERENCE, OWN = (Form(model.model_json_schema()) for model in forms.GOAL_MODELS)
 FREE = {"Application.parameters"}
 FREE_PLACES = ("applications[0].parameters", "applications[1].parameters_json")
 ELSEWHERE = {
@@ -27,28 +27,28 @@ ELSEWHERE = {
 
 
 @pytest.mark.parametrize(
-    ("valid", "form"), [(rich.reference_goal, REFERENCE), (rich.own_goal, OWN)]
+    ("valid", "form"), [(forms.reference_goal, REFERENCE), (forms.own_goal, OWN)]
 )
 def test_a_mistake_anywhere_is_a_fault_at_its_place(valid: Callable[[], Goal], form: Form) -> None:
-    repo = MemoryRepo(rich.rich())
+    repo = MemoryRepo(forms.rich())
     assert not isinstance(repo.copy().take(valid()), Refused)
     problems = []
-    for mutation in mutations.mutations(valid(), form.limits()):
+    for mutation in forms.mutations(valid(), form.limits()):
         taken = repo.copy().take(mutation.document)
-        place = mutations.path(mutation.place)
+        place = forms.path(mutation.place)
         also = tuple(field for start, field in ELSEWHERE.items() if place.startswith(start))
         found = [
             fault
             for fault in (taken.faults if isinstance(taken, Refused) else ())
             if mutation.is_at(fault.field) or not fault.field.startswith(also)
         ]
-        problems.append(mutations.problem(mutation, found, form, free=FREE_PLACES))
+        problems.append(forms.problem(mutation, found, form, free=FREE_PLACES))
     assert list(filter(None, problems)) == []
 
 
 def test_every_field_of_a_goal_is_tried() -> None:
-    assert REFERENCE.fields() == REFERENCE.fields_in(rich.reference_goal())
-    assert OWN.fields() == OWN.fields_in(rich.own_goal())
+    assert REFERENCE.fields() == REFERENCE.fields_in(forms.reference_goal())
+    assert OWN.fields() == OWN.fields_in(forms.own_goal())
 
 
 def test_only_the_listed_fields_may_have_any_value() -> None:

@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base import naming
 from demandops.base.errors import MOST_FAULTS, Fault, Refused, suggestion
 from demandops.model.demand.goals import form_faults
 
@@ -139,16 +138,6 @@ def test_similar_names_are_found_soon_however_many_words_are_unknown() -> None:
     assert calls[0] < 50 * 10_000, "a word must not be compared with each name"
     for word in ("vehicle-0123x", "xehicle-0123", "vehicle-123"):
         assert suggestion(word, names) == "; did you mean 'vehicle-0123'?"
-
-
-def test_names_are_made_once_for_each_of_many_topics() -> None:
-    count, made = 300, put("many")
-    clouds = [{"topic": f"/c{number}", "source": "vehicle00"} for number in range(count)]
-    made["applications"][0]["inputs"] = {"point_cloud": clouds}
-    before = naming.topic_part.cache_info()
-    assert MemoryRepo().send(made).outcome == "booked"
-    after = naming.topic_part.cache_info()
-    assert after.hits + after.misses - before.hits - before.misses < 50 * count
 
 
 @pytest.mark.parametrize(

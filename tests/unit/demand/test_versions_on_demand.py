@@ -73,15 +73,6 @@ def test_what_follows_from_another_version(case: dict[str, str]) -> None:
     assert repo.rendered() == before
 
 
-def test_an_update_says_what_changes() -> None:
-    repo = MemoryRepo(config("update"))
-    repo.send(put("a"))
-    assert [change.details for change in repo.send(put("b", "testing")).releases] == [
-        ("- version 1.0.0", f"- image {name} 1.0.0", "+ version 1.1.0", f"+ image {name} 1.1.0")
-        for name in ("object-detection", "object-fusion")
-    ]
-
-
 def test_a_shared_service_follows_the_newest_of_its_applications() -> None:
     repo = MemoryRepo(config("update"))
     repo.send(put("a"))

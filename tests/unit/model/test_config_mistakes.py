@@ -24,8 +24,13 @@ V1 = "- id: vehicle01\n"
 Files = Mapping[str, str | None]
 
 _LISTED = plain_yaml.load(Path(__file__).with_name("config-mistakes.yaml").read_text())
+_EXAMPLES = Path(__file__).parents[3] / "examples"
+_OF_A_CLUSTER = {
+    "appdefs/map-server/service.yaml": (_EXAMPLES / "map-server" / "service.yaml").read_text()
+}
 _BASES: Mapping[str, Mapping[str, Any]] = {
     **_LISTED["bases"],
+    "a service for a cluster": _OF_A_CLUSTER | _LISTED["bases"]["a service for a cluster"],
     "Argo CD": {ROOT: skeleton("argocd")[ROOT]},
     "a second definition": {
         path.replace("object-detection-fusion/", "copy/", 1): text

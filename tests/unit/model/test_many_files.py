@@ -22,7 +22,7 @@ from demandops.model.config.config import (
 )
 from demandops.model.config.load import load
 
-from tests.kit import plain_yaml, rich
+from tests.kit import forms, plain_yaml
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
 
@@ -65,7 +65,7 @@ def split(files: Mapping[str, str], random: Random) -> dict[str, str]:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_entries_count_wherever_they_are(seed: int) -> None:
-    files = rich.rich() if seed % 2 else configuration()
+    files = forms.rich() if seed % 2 else configuration()
     spread = split(files, Random(seed))
     assert {path for path in spread if collection_of(path) not in (None, path)}
     whole, parts = load(files), load(spread)

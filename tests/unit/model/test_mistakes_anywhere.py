@@ -10,15 +10,15 @@ from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput
 from demandops.model.config.load import load
 
-from tests.kit import mutations, rich
-from tests.kit.mutations import Form
+from tests.kit import forms
+from tests.kit.forms import Form
 
 DOMAINS = "policy/access-domains.yaml"
-FORMS = {file: Form(model.model_json_schema()) for file, model in rich.CONFIG_MODELS.items()}
+FORMS = {file: Form(model.model_json_schema()) for file, model in forms.CONFIG_MODELS.items()}
 DOCUMENTS = [
-    *((rich.rich, file) for file in FORMS),
-    *((rich.rich, f"overrides/{name}.yaml") for name in ("hold", "deny", "keep", "refuse-new")),
-    (rich.rich_with_api, "demandops.yaml"),
+    *((forms.rich, file) for file in FORMS),
+    *((forms.rich, f"overrides/{name}.yaml") for name in ("hold", "deny", "keep", "refuse-new")),
+    (forms.rich_with_api, "demandops.yaml"),
 ]
 PROBES = ("startupProbe", "readinessProbe", "livenessProbe")
 FREE = {
@@ -65,13 +65,13 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(
     whole, form = files(), form_of(file)
     assert faults(whole) == []
     problems = []
-    for mutation in mutations.mutations(parsed[whole[file]], form.limits()):
+    for mutation in forms.mutations(parsed[whole[file]], form.limits()):
         parsed["mutated"] = mutation.document
         found = faults(whole | {file: "mutated"})
         if file == DOMAINS:  # an invalid domain has no nodes, so overrides have faults too
             found = [one for one in found if one.file == file or "access domain" not in one.message]
         free = FREE_PLACES if file != "registry/charts.yaml" else ()
-        problems.append(mutations.problem(mutation, found, form, free=free, file=file))
+        problems.append(forms.problem(mutation, found, form, free=free, file=file))
     assert list(filter(None, problems)) == []
 
 

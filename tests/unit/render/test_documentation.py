@@ -42,6 +42,8 @@ def test_every_field_of_a_route_is_explained_with_the_types_that_honour_it() -> 
     rows = re.findall(r"^\| `(\w+)`[^|]*\|[^|]*\| ([^|]*) \|$", PAGE, re.MULTILINE)
     told = {name: row for name, row in rows if name in ROUTE_OPTIONS}
     assert told.keys() == {*ROUTE_OPTIONS}
+    honoured = frozenset().union(*(kind.options for kind in CONNECTION_TYPES))
+    assert honoured == {*ROUTE_OPTIONS} - {"type", "reverse"}, "each does something in some client"
     for kind in CONNECTION_TYPES:
         label = {"MQTT": "MQTT", "ZENOH": "Zenoh", "ROS": "ROS"}[kind.name]
         listed = {name for name, row in told.items() if label in row and name != "type"}

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import click
@@ -13,8 +13,7 @@ from demandops.base.quoting import lines, one_line
 from demandops.cli.formats import output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.queries.commits import entry_lines, release_lines
-from demandops.decide.bookkeeping import EntryChange
-from demandops.decide.changeset import CHANGE_ORDER, FileChange
+from demandops.decide.changeset import FileChange
 from demandops.repo.merge_check import merge_check
 from demandops.repo.merge_check.merge_check import CheckResult
 from demandops.repo.merge_check.rendered_charts import MISSING, NO_HELM, RenderedCharts
@@ -39,24 +38,25 @@ _ROOM_FOR_NOTE = 200
 
 
 def report(checked: CheckResult, longest: int = LONGEST) -> str:
-    parts = [f"{MARK}\n", *_findings(checked), *_consequence(checked)]
-    room = longest - _ROOM_FOR_NOTE
-    taken, left_out = list[str](), 0
-    for part in parts:
-        if len(part) <= room:
-            taken.append(part)
-            room -= len(part)
-        else:
-            left_out += 1
+    text, left_out, room = f"{MARK}\n", 0, longest - _ROOM_FOR_NOTE
+    for part in _findings(checked):
+        fits = len(text) + len(part) <= room
+        text += part if fits else ""
+        left_out += not fits
+    for section in _sections(checked, _MOST_DIFF_LINES_JSON):
+        lines = [one_line(line, _LONGEST_SPAN) for line in section.lines]
+        part = section.markdown(lines)
+        while lines and len(text) + len(part) > room:
+            lines = [] if section.is_file else lines[: len(lines) // 2]
+            part = section.markdown([*lines, "…"]) if lines else ""
+        text += part
+        left_out += len(lines) < len(section.lines)
     if left_out:
-        many = f"{left_out} parts of this report are"
-        if left_out == 1:
-            many = "One part of this report is"
-        taken.append(
-            f"\n{many} left out because a comment has a limited length; "
-            "`demandops check --output json` has more.\n"
+        text += (
+            "\nParts cut or left out, because a comment has a limited length: "
+            f"{left_out}; `demandops check --output json` has more.\n"
         )
-    return "".join(taken)
+    return text
 
 
 def chart_lines(
@@ -110,68 +110,15 @@ def _findings(checked: CheckResult) -> Iterator[str]:
             yield f"\n- {kind}{': '.join([*places, code(fault.message)])}"
         if faults:
             yield "\n"
-    for suggestion in checked.suggestions:
-        body = f"Merge this as {code(suggestion.file)}:\n\n{fence(suggestion.text, 'yaml')}"
-        if suggestion.not_covered:
-            body += f"\nNo override can change {', '.join(map(code, suggestion.not_covered))}.\n"
-        if suggestion.other_releases:
-            others = ", ".join(map(code, suggestion.other_releases))
-            body += f"\nThis override also applies to {others}.\n"
-        yield _folded(f"Instead of editing {_plain(suggestion.instead_of)}", body)
-
-
-def _consequence(checked: CheckResult) -> Iterator[str]:
-    if (consequence := checked.preview) is None:
+    if checked.preview is None:
         yield "\nFix the errors to see what merging would do.\n"
-        return
-    if not consequence.files and not checked.bookkeeping:
+    elif not checked.preview.files and not checked.bookkeeping:
         yield "\nMerging changes no release and no demand.\n"
-        return
-    yield "\n### Desired state\n"
-    kinds = [release.change for release in consequence.releases]
-    if counts := [f"{kinds.count(kind)} to {kind}" for kind in CHANGE_ORDER if kind in kinds]:
-        yield f"\nReleases: {', '.join(counts)}.\n"
-    else:
-        yield "\nNo release starts, changes or stops.\n"
-    for release in consequence.releases:
-        details = "".join(f"\n  - {code(detail)}" for detail in release.details)
-        yield f"\n- {release.change}s {code(release.name)}: {code(release.what)}{details}"
-    yield "\n"
-    yield "\n### Bookkeeping\n"
-    if checked.bookkeeping is None:
-        yield "\nNot compared, because the base has no valid files.\n"
-    elif not checked.bookkeeping:
-        yield "\nUnchanged.\n"
-    yield from map(_entry, checked.bookkeeping or ())
-    yield "\n"
-    if consequence.files:
-        yield f"\n### Files that the generator writes or removes: {len(consequence.files)}\n"
-    for file in consequence.files:
-        if file.after is None:
-            yield f"\n- removed: {code(file.path)}"
-    yield "\n"
-    for file in consequence.files:
-        if file.after is not None:
-            yield _folded(_plain(file.path), fence("\n".join(file.diff()), "diff"))
-
-
-def _entry(entry: EntryChange) -> str:
-    word = "new" if entry.change == "added" else entry.change
-    line = f"\n- {word}: {entry.kind} {code(entry.name)}"
-    if entry.change != "changed":
-        return f"{line} for {', '.join(map(code, entry.requesters))}"
-    facts = [f"\n  - no longer {code(fact)}" for fact in entry.lost]
-    facts += [f"\n  - now {code(fact)}" for fact in entry.gained]
-    return line + "".join(facts)
-
-
-def _folded(summary: str, body: str) -> str:
-    return f"\n<details><summary>{summary}</summary>\n\n{body}\n</details>\n"
 
 
 def _plain(path: str) -> str:
     # for a <summary>, in which Markdown is not rendered
-    safe = re.sub(r"[^A-Za-z0-9_./-]", lambda char: f"&#{ord(char[0])};", one_line(path))
+    safe = re.sub(r"[^A-Za-z0-9_./, -]", lambda char: f"&#{ord(char[0])};", one_line(path))
     return f"<code>{safe if len(safe) <= _LONGEST_SPAN else '…'}</code>"
 
 
@@ -261,6 +208,7 @@ def _data(checked: CheckResult) -> Json:
         "base_valid": checked.base_valid,
         "releases": [asdict(release) for release in merge.releases] if merge else None,
         "files": changes if merge else None,
+        "pending": list(checked.pending),
         "diff_lines_left_out": left_out,
         "bookkeeping": None if entries is None else [asdict(entry) for entry in entries],
     }
@@ -280,34 +228,49 @@ def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], 
     return shown, left_out
 
 
-def _lines(checked: CheckResult) -> Iterator[str]:  # noqa: PLR0912 - a part each
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """A part of the result, as the terminal and a comment show it."""
+
+    title: str
+    lines: Sequence[str]
+    language: str = ""  # of a file's text or of a difference, which a comment folds
+    note: str = ""
+
+    @property
+    def is_file(self) -> bool:
+        return bool(self.language)
+
+    def markdown(self, lines: Sequence[str]) -> str:
+        note = f"\n{code(self.note)}\n" if self.note else ""
+        body = fence("\n".join(lines), self.language or "diff")
+        if self.is_file:
+            summary = _plain(self.title)
+            return f"\n<details><summary>{summary}</summary>\n\n{body}{note}\n</details>\n"
+        return f"\n### {self.title.capitalize()}\n\n{body}{note}"
+
+    def text(self) -> Iterator[str]:
+        yield f"\n{self.title}:" if self.language != "diff" else ""
+        if self.language == "yaml":
+            yield ""
+        yield from (line if self.is_file else f"  {line}" for line in self.lines)
+        if self.note:
+            yield f"\n({self.note})"
+
+
+def _sections(checked: CheckResult, most_lines: int) -> Iterator[_Section]:
     for override in checked.suggestions:
-        yield f"\ninstead of editing {override.instead_of}, write {override.file}:\n"
-        yield from override.text.splitlines()
-        if override.other_releases:
-            yield f"\n(this override also applies to {', '.join(override.other_releases)})"
-    if checked.newer:
-        commits = "a commit" if checked.newer == 1 else f"{checked.newer} commits"
-        yield (
-            f"\nthe merge target has {commits} that this checkout lacks: git rebase --autostash "
-            f"{checked.target}"
-        )
+        others = ", ".join(override.other_releases)
+        note = f"this override also applies to {others}" if others else ""
+        title = f"instead of editing {override.instead_of}, write {override.file}"
+        yield _Section(title, override.text.splitlines(), "yaml", note)
     if (consequence := checked.preview) is None:
-        if checked.suggestions:
-            yield "\nfix the errors to see what merging would do"
         return
-    if consequence.files or checked.bookkeeping:
-        compared = f", compared with {checked.base[:10]}" if checked.base else ""
-        yield f"\nwhat merging would do{compared}:"
-    if checked.base and not checked.base_valid:
-        yield f"({checked.base[:10]} is not valid, so what is in effect at it is compared)"
     if consequence.releases:
-        yield "\ndesired state:"
-        yield from (f"  {line}" for line in release_lines(consequence.releases))
+        yield _Section("desired state", [*release_lines(consequence.releases)])
     if checked.bookkeeping:
-        yield "\nbookkeeping:"
-        yield from (f"  {line}" for line in entry_lines(checked.bookkeeping))
-    others, files = {*consequence.other_files}, consequence.files
+        yield _Section("bookkeeping", [*entry_lines(checked.bookkeeping)])
+    files = consequence.files
     if not files:
         return
     # a long new file that belongs to no release is listed without a diff
@@ -315,19 +278,43 @@ def _lines(checked: CheckResult) -> Iterator[str]:  # noqa: PLR0912 - a part eac
         file.path: length
         for file in files
         if file.before is None
-        and file.path in others
+        and file.path in consequence.other_files
         and (length := len((file.after or "").splitlines())) > _LONG_NEW_FILE
     }
+    listed = [
+        f"{'remove' if file.after is None else 'write '} {file.path}"
+        + (f" (new, {new[file.path]} lines)" if file.path in new else "")
+        for file in files
+    ]
     count = "1 file" if len(files) == 1 else f"{len(files)} files"
-    yield f"\nthe generator will write or remove {count}:"
-    for file in files:
-        note = f" (new, {new[file.path]} lines)" if file.path in new else ""
-        yield f"  {'remove' if file.after is None else 'write '} {file.path}{note}"
+    note = "without this edit too, as a generator has yet to carry out earlier commits"
+    note = f"{len(checked.pending)} of them {note}" if checked.pending else ""
+    yield _Section(f"the generator will write or remove {count}", listed, note=note)
     written = tuple(file for file in files if file.after is not None and file.path not in new)
-    shown, left_out = _bounded(written, _MOST_DIFF_LINES)
-    for text in shown.values():
-        yield ""
-        yield from text.splitlines()
+    diffs, left_out = _bounded(written, most_lines)
+    yield from (_Section(path, text.splitlines(), "diff") for path, text in diffs.items())
     if left_out:
         most = f"{_MOST_DIFF_LINES_JSON:,}"
-        yield f"\n{left_out} more lines of differences are left out; --output json has up to {most}"
+        told = f"{left_out} more lines of differences; --output json has up to {most}"
+        yield _Section("left out", [told])
+
+
+def _lines(checked: CheckResult) -> Iterator[str]:
+    consequence, sections = checked.preview, [*_sections(checked, _MOST_DIFF_LINES)]
+    for section in sections[: len(checked.suggestions)]:
+        yield from section.text()
+    if checked.newer:
+        commits = "a commit" if checked.newer == 1 else f"{checked.newer} commits"
+        yield (
+            f"\nthe merge target has {commits} that this checkout lacks: git rebase --autostash "
+            f"{checked.target}"
+        )
+    if consequence is None and checked.suggestions:
+        yield "\nfix the errors to see what merging would do"
+    if consequence and (consequence.files or checked.bookkeeping):
+        compared = f", compared with {checked.base[:10]}" if checked.base else ""
+        yield f"\nwhat merging would do{compared}:"
+    if consequence and checked.base and not checked.base_valid:
+        yield f"({checked.base[:10]} is not valid, so what is in effect at it is compared)"
+    for section in sections[len(checked.suggestions) :]:
+        yield from section.text()

@@ -21,10 +21,9 @@ from demandops.cli.formats import Command, output_option, show
 from demandops.cli.output import busy
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.decide.state import State, try_configuration
-from demandops.model.config.base_model import document
+from demandops.model.config.base_model import document, matches
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
 from demandops.model.config.load import load
-from demandops.model.config.policy import matches
 from demandops.model.config.registry import Image
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo import new_repo
@@ -291,7 +290,8 @@ def application(  # noqa: PLR0913 - as many as options
     types = dict(_read("--input", word) for word in values["--input"])
     pulled = _read("--image", values["--image"][0])
     # a demand can name only nodes in an access domain
-    nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
+    known = (*config.domain_of, *config.example_nodes())
+    nodes = sorted(known, key=lambda id: (config.nodes[id].type != "edge", id))
     if not (node or nodes):
         raise StateRepoError(
             "the inventory has no node in an access domain, so no demand can be made; add one "

@@ -18,25 +18,11 @@ from demandops.model.config.inventory import id_in_domain
 from demandops.model.demand.demand import (
     AnyDemand,
     Application,
-    Decommission,
     Held,
     InputTopic,
     Item,
 )
 from demandops.model.ledger.ledger import Ledger
-
-
-def prepared(demand: AnyDemand, state: State) -> tuple[AnyDemand, list[Fault]]:
-    """Return the demand with all that does not depend on the nodes that are chosen for it."""
-    config, ledger = state.config, state.ledger
-    if isinstance(demand, Decommission):
-        return replace(demand, nodes=config.nodes_of(demand.id), is_complete=True), []
-    demand = with_definitions(demand, config)
-    # the id of a separate instance comes first, because the placement looks for claims on it
-    demand = with_separate_instances(demand, config)
-    demand, unclear = with_chosen_domains(demand, config, ledger)
-    demand, unread = flows.with_topics_of_outputs(demand, ledger, config)
-    return demand, [*unclear, *unread]
 
 
 def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -> AnyDemand:
@@ -125,7 +111,7 @@ def with_chosen_domains(
     request: AnyDemand, config: Config, ledger: Ledger
 ) -> tuple[AnyDemand, list[Fault]]:
     """Choose a domain for each node; a node that may be used in several domains is a fault."""
-    if not config.hosts:
+    if not (config.hosts or config.node_patterns):
         return request, []
     faults: list[Fault] = []
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 
 from demandops.base.errors import Fault, fault
 from demandops.connections.connection import Connection
-from demandops.model.config.base_model import duration_text, seconds_of
+from demandops.model.config.base_model import duration_text, matches, seconds_of
 from demandops.model.config.config import Config
-from demandops.model.config.policy import AccessDomain, Rule, matches
+from demandops.model.config.policy import AccessDomain, Rule
 from demandops.model.demand.demand import Application, Demand, Item, Lease
 from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import Ledger

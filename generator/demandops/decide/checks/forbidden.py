@@ -20,9 +20,10 @@ from demandops.decide.planning.release_keys import (
     newest_asked,
 )
 from demandops.model.config.appdef import VersionPolicy
+from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config
 from demandops.model.config.override import Selector, format_time
-from demandops.model.config.policy import AccessDomain, matches
+from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ApplicationVersion, precedence
 from demandops.model.demand.demand import Application, Demand, Item
 from demandops.model.ledger.claim import Claim

@@ -20,7 +20,7 @@ from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
 from demandops.decide.placement import capacity
 from demandops.decide.placement.capacity import Need, NoRoom, Usage
-from demandops.decide.planning.flows import instances
+from demandops.decide.planning.flows import instances, version_of_instance
 from demandops.decide.planning.overrides import with_overridden_nodes
 from demandops.decide.planning.release_keys import is_needed
 from demandops.model.config import inventory
@@ -69,8 +69,8 @@ def on_node(app: Application, node: str, service: Service | None, world: World) 
 
 def shares(service: Service, app: Application, other: Application) -> bool:
     # A separate instance of an application shares only with separate instances of its version.
-    identity = (app.appdef, app.node, app.own_version)
-    return service.scope == "topic" and identity == (other.appdef, other.node, other.own_version)
+    mine, its = ((a.appdef, a.node, version_of_instance(a, service)) for a in (app, other))
+    return service.scope == "topic" and mine == its
 
 
 @dataclass(slots=True)
@@ -336,7 +336,7 @@ def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
 def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
     if requirement.role not in ("", node.type):
         yield f"the role {quoted(requirement.role)}"
-    labels = node.labels() if requirement.labels else {}
+    labels = node.labels if requirement.labels else {}
     for key, value in requirement.label_pairs:
         if labels.get(key) != value:
             yield f"the label {quoted(f'{key}={value}')}"

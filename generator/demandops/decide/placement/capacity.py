@@ -117,9 +117,3 @@ class NoRoom(Refused):
             )
             faults.append(fault("", message, code="capacity"))
         super().__init__(faults)
-
-
-def refuse_excess(usage: Usage, grown: Mapping[Need, int], config: Config) -> None:
-    refusal = NoRoom(usage, grown, config)
-    if refusal.full:
-        raise refusal

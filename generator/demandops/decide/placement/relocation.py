@@ -199,7 +199,8 @@ def _moved(
         raise Refused(faults)
     grown, host = capacity.growth_by(world, after, changes), world.config.host_of(chosen.node)
     there = {need: amount for need, amount in grown.items() if need[0] == host}
-    capacity.refuse_excess(usage, there, world.config)
+    if (refusal := capacity.NoRoom(usage, there, world.config)).full:
+        raise refusal
     return after, followed, changes, grown
 
 

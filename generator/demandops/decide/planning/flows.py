@@ -54,7 +54,7 @@ def distinguishing_text(config: Config, role: str, topic: InputTopic, version: s
     """Return the text that makes topic names differ although their source is the same."""
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
-    return topic.distinguishing_text(further, version)
+    return " ".join(filter(None, (topic.topic if further else "", version)))
 
 
 # A fusion reads hundreds of such topics, and each demand plans the fusion again.
@@ -189,7 +189,7 @@ def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
 def version_of_instance(app: Application, service: Service) -> str:
     """Return the ``version`` in the keys of a service's instances; empty unless separate."""
     # A shared service runs once for all versions: two drivers of one sensor do not work.
-    return "" if service.shared else app.own_version
+    return app.version if app.separate and not service.shared else ""
 
 
 def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicKey]:

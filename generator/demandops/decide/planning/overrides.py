@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 
 from demandops.base.naming import Subject, SubjectKind
+from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override, Selector, Shaping
-from demandops.model.config.policy import matches
 from demandops.model.demand.demand import Application, Item
 from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim, ClaimKey, requesters_of
 from demandops.model.ledger.ledger import By, Ledger, World
@@ -82,7 +82,7 @@ def fits(selector: Selector, traits: Traits, config: Config) -> bool:
 
 def has_labels(selector: Selector, node: str, config: Config) -> bool:
     entry = config.nodes.get(node)
-    labels = entry.labels() if entry else {}
+    labels = entry.labels if entry else {}
     return all(labels.get(key) == value for key, value in (selector.labels or {}).items())
 
 

@@ -184,7 +184,21 @@ def affected_keys(
     before, after = without_suspended(before), without_suspended(after)
     keys: dict[ReleaseKey, None] = {}
     for change in changes:
-        subject, claims = change.key.subject, _differing(change, after)
+        subject, claims = change.key.subject, (change.before, change.after)
+        if change.before and change.after and change.before.is_on_application:
+            # reduced to the inputs that differ, if nothing else that matters to a release does
+            mine, its = change.before.application, change.after.application
+            same_requesters = change.before.requesters == change.after.requesters
+            if (
+                replace(its, inputs=mine.inputs) == mine
+                # a parameter's value may depend on the booking times
+                and not mine.parameters
+                and (same_requesters or not _may_depend_on_requesters(its, after))
+            ):
+                claims = (
+                    replace(change.before, held=_with_inputs_not_in(mine, its)),
+                    replace(change.after, held=_with_inputs_not_in(its, mine)),
+                )
         old, new = before.ledger.application(subject.id), after.ledger.application(subject.id)
         is_moved = False
         if subject.kind is SubjectKind.APPLICATION and old and new:
@@ -201,27 +215,12 @@ def affected_keys(
     return tuple(keys)
 
 
-def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim | None]:
-    """Return the claims before and after a change, reduced to the inputs that differ if no more."""
-    before, after = change.before, change.after
-    if before is None or after is None or not before.is_on_application:
-        return before, after
-    old, new = before.application, after.application
-    is_same = replace(new, inputs=old.inputs) == old
-    if not is_same or old.parameters:  # a parameter's value may depend on the booking times
-        return before, after
-    if before.requesters != after.requesters:
-        # Other requesters change a release only if an override selects by them, or a service
-        # definition derives the number of replicas from them.
-        selectors = (selector for override in world.overrides for selector in override.select)
-        services = world.config.services.get(new.appdef, {}).values()
-        if any(selector.requesters for selector in selectors) or any(
-            service.scaling.may_depend_on_requesters for service in services
-        ):
-            return before, after
-    return (
-        replace(before, held=_with_inputs_not_in(old, new)),
-        replace(after, held=_with_inputs_not_in(new, old)),
+def _may_depend_on_requesters(app: Application, world: World) -> bool:
+    # if an override selects by them, or a service's definition derives the replicas from them
+    selectors = (selector for override in world.overrides for selector in override.select)
+    services = world.config.services.get(app.appdef, {}).values()
+    return any(selector.requesters for selector in selectors) or any(
+        service.scaling.may_depend_on_requesters for service in services
     )
 
 

@@ -368,9 +368,13 @@ class Service(Deployed):
     folder: str
     shared: bool
     scope: Scope
+    at_source: bool
+    values: str  # the path of its template
     # The origin of each input: a role of the appdef, or `<service>.<output>`
     inputs: dict[str, str]
     parameters: dict[str, Parameter]
+    # What Kubernetes' scheduler can count of `requests`, by its own names
+    pod_requests: dict[str, str] = Field(default_factory=dict)
     # For a service that runs once for each topic of a role: that role
     root: str | None = None
     # If each instance has only one source: the roles of the source's topics that the instance
@@ -381,10 +385,6 @@ class Service(Deployed):
     # For a service that runs once for each cluster: a map from the node of an application to the
     # node of the service in the same cluster
     runs_at: dict[str, str] = Field(default_factory=dict)
-
-    @property
-    def at_source(self) -> bool:
-        return self.placement == "source"
 
     @property
     def is_movable(self) -> bool:
@@ -415,19 +415,29 @@ def resolved_services(  # noqa: PLR0912 - a branch for each fault
     services = {
         name: Service.model_construct(
             # a role in `each` is an input, even if `inputs` lacks it
-            **{**dict(own), "inputs": ({own.each: own.each} if own.each else {}) | own.inputs},
+            **{
+                **dict(own),
+                "inputs": ({own.each: own.each} if own.each else {}) | own.inputs,
+                "values": f"appdefs/{appdef.name}/{own.values}",
+            },
             name=name,
             folder=appdef.name,
             shared=False,
             scope="topic" if own.each else "application",
+            at_source=own.placement == "source",
             parameters=appdef.parameters,
         )
         for name, own in appdef.services.items()
     }
     for name, bound in appdef.uses.items():
         if name in definitions:
-            used = {**dict(definitions[name]), "inputs": bound}
-            services[name] = Service.model_construct(**used, folder=name, shared=True)
+            used = definitions[name]
+            services[name] = Service.model_construct(
+                **{**dict(used), "inputs": bound, "values": f"appdefs/{name}/{used.values}"},
+                folder=name,
+                shared=True,
+                at_source=used.placement == "source",
+            )
     problems: list[Problem] = []
     for name, bound in appdef.uses.items():
         if name not in definitions:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
+from fnmatch import translate
 from functools import lru_cache
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
@@ -173,6 +174,17 @@ Text = Annotated[str, Visible]
 OneForm = AfterValidator(one_form)
 
 Pattern = Annotated[Text, OneForm]
+
+
+def matches(name: str, patterns: tuple[str, ...]) -> bool:
+    return any(name == pattern or _compiled(pattern)(name) for pattern in patterns)
+
+
+@lru_cache(65_536)  # a policy may have thousands, more than Python's own cache
+def _compiled(pattern: str) -> Callable[[str], object]:
+    # fnmatch has sets of characters, which begin with a bracket; here a bracket is only itself
+    return re.compile(translate(pattern.replace("[", "[[]"))).match
+
 
 Approval = Literal["none", "required"]
 

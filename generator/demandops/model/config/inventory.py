@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import (
@@ -374,7 +374,8 @@ class Node(CamelModel):
             )
         return self
 
-    def labels(self) -> dict[str, str]:
+    @cached_property
+    def labels(self) -> Mapping[str, str]:
         return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
 
     def in_domain(self, further: FurtherDomain) -> Node:
@@ -382,7 +383,7 @@ class Node(CamelModel):
         return self.model_copy(
             update={
                 "id": id_in_domain(self.id, further.name),
-                "selector": self.labels(),
+                "selector": self.labels,
                 "zenoh": further.zenoh,
                 "wan": further.wan,
                 "bridged": {},

@@ -25,11 +25,11 @@ from demandops.model.config.base_model import (
     Items,
     Pattern,
     Visible,
+    matches,
     parse_time,
     time_text,
 )
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
-from demandops.model.config.policy import matches
 from demandops.model.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
 from demandops.templating.charts import overridden
 
@@ -187,6 +187,15 @@ class OverrideFile(FileModel):
     @property
     def end(self) -> datetime | None:
         return parse_time(self.expires) if self.expires else None
+
+
+def override_selects(text: str, kind: str, name: str) -> bool:
+    """Return whether a file's text selects a thing by its name; one that is not valid does not."""
+    try:
+        selectors = base_model.parse_file(OverrideFile, text, "").select
+    except InvalidInput:
+        return False
+    return any(matches(name, getattr(each, f"{kind}s") or ()) for each in selectors)
 
 
 class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so they have no hash

@@ -6,10 +6,6 @@ apply to demands for these nodes.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable
-from fnmatch import translate
-from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
@@ -22,16 +18,6 @@ from demandops.model.config.inventory import Credentials, NodeId, RosDomainId
 
 Duration = Annotated[str, base_model.readable_by(base_model.seconds_of)]
 Patterns = Annotated[tuple[base_model.Pattern, ...], Field(strict=False, min_length=1)]
-
-
-def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    return any(name == pattern or _compiled(pattern)(name) for pattern in patterns)
-
-
-@lru_cache(65_536)  # a policy may have thousands, more than Python's own cache
-def _compiled(pattern: str) -> Callable[[str], object]:
-    # fnmatch has sets of characters, which begin with a bracket; here a bracket is only itself
-    return re.compile(translate(pattern.replace("[", "[[]"))).match
 
 
 class Rule(CamelModel):

@@ -214,9 +214,6 @@ class ApplicationVersion:
         charts = (chart.version for _, chart in sorted(self.charts.items()))
         return tuple(map(precedence, [self.name] if self.name else charts))
 
-    def image(self, name: str, image: Image) -> Image:
-        return self.images[name].over(image) if name in self.images else image
-
 
 _EnvName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 _Quantity = Annotated[str, StringConstraints(pattern=r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi)?$")]

@@ -61,11 +61,6 @@ class InputTopic:
     def __post_init__(self) -> None:
         object.__setattr__(self, "topic", absolute_topic(self.topic))
 
-    def distinguishing_text(self, further: bool, version: str) -> str:
-        if not further:
-            return version
-        return f"{self.topic} {version}" if version else self.topic
-
 
 @dataclass(frozen=True, slots=True, order=True)
 class Delivery:
@@ -208,10 +203,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     @property
     def subject(self) -> Subject:
         return Subject(SubjectKind.APPLICATION, self.id)
-
-    @property
-    def own_version(self) -> str:  # in the names of services and topics
-        return self.version if self.separate else ""
 
     @property
     def home(self) -> str:

@@ -170,7 +170,7 @@ def _value_problem(value: object, depth: int) -> str:
         return _TOO_DEEP
     if isinstance(value, float) and not math.isfinite(value):
         return f"holds {value}, which is not a finite number; give another value, or leave it out"
-    if isinstance(value, str) and not is_unicode(value):
+    if isinstance(value, str) and _HALF.search(value):
         return f"holds {quoted(value)}, which is not Unicode text; write whole characters"
     if isinstance(value, dict) and (long := [key for key in value if len(key) > _LONGEST_KEY]):
         length = f"{len(long[0])} characters, but at most {_LONGEST_KEY} are allowed"
@@ -353,10 +353,8 @@ def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 
     return demand
 
 
-def is_unicode(text: str) -> bool:
-    # JSON can escape half of a surrogate pair, and no file in UTF-8 can contain the result
-    return not any("\ud800" <= char <= "\udfff" for char in text)
-
+# JSON can escape half of a surrogate pair, and no file in UTF-8 can contain the result
+_HALF = re.compile("[\ud800-\udfff]")
 
 # the values in these fields are the application's own, and stay as they are
 _OWN_VALUES = frozenset({"parameters", "parameters_json"})
@@ -370,7 +368,7 @@ def _in_one_form(value: Any, location: tuple[int | str, ...], faults: list[Fault
         return [_in_one_form(part, (*location, at), faults) for at, part in enumerate(value)]
     if isinstance(value, dict):
         for key in value:
-            if not is_unicode(key):
+            if _HALF.search(key):
                 message = f"the key {strict_yaml.short_repr(key)} is not text"
                 faults.append(fault(field_path(location), f"{message}; write whole characters"))
         return {key: _in_one_form(part, (*location, key), faults) for key, part in value.items()}

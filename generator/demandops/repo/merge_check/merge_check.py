@@ -33,6 +33,7 @@ from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Ledger, World, changes_on, ledger_of
+from demandops.render import gitops
 from demandops.render.gitops import BOOTSTRAP_ROOT, path_of
 from demandops.repo.git import tree as trees
 from demandops.repo.load import ledger_files
@@ -67,6 +68,8 @@ class CheckResult:
     # the name of the merge target, and how many commits it has that the checkout lacks
     target: str = ""
     newer: int = 0
+    # the files of the preview that a generator would write without the edit too
+    pending: tuple[str, ...] = ()
     warnings: tuple[Fault, ...] = ()  # likely mistakes, and what a person has to do after the merge
     charts: RenderedCharts | None = None
 
@@ -139,6 +142,7 @@ def check(
         result = replace(
             result,
             preview=preview,
+            pending=tuple(edit.pending(preview)),
             charts=charts,
             bookkeeping=booked,
             warnings=(
@@ -283,6 +287,20 @@ class _Edit:
                 files.pop(path, None)
                 files |= {path: wanted[path]} if path in wanted else {}
         return files
+
+    def pending(self, preview: MergePreview) -> Iterator[str]:
+        if (state := self.start.state) is None:
+            return
+        releases = {path_of(release): release for release in self.start.releases().values()}
+        for file in preview.files:
+            is_gone = file.after is None and not file.path.rsplit("/", 1)[-1].startswith("_")
+            if (release := releases.get(file.path)) is None:
+                if is_gone:
+                    yield file.path
+                continue
+            with suppress(InvalidInput):
+                if gitops.render(release, state.config, state.evaluate) == file.after:
+                    yield file.path
 
     def faults_once_merged(self, start: Base) -> Iterator[Fault]:
         # of the edit and the newer commits of the merge target together, or of these commits alone

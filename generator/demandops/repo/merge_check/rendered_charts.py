@@ -34,8 +34,8 @@ from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.decide import changeset
 from demandops.decide.state import State, trial_releases
+from demandops.model.config.base_model import matches
 from demandops.model.config.config import DOMAINS_FILE, Config
-from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease
 from demandops.render.gitops import path_of, values_of
 from demandops.repo.git import child_processes
