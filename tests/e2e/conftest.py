@@ -21,6 +21,7 @@ from tests.e2e.common.world import DOMAINS, World, running
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Manifest, build_manifest
 from tests.e2e.rig.tools import Report
+from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import Client, reserved
 
 MakeWorld = Callable[[], World]
@@ -121,7 +122,7 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 @pytest.fixture
 def requester(ros_domain: int) -> Iterator[DemandClient]:
-    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=120) as made:
+    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=2 * PATIENCE_S) as made:
         yield made
 
 

@@ -20,6 +20,7 @@ from tests.e2e.common.goals import CLOUD, application
 from tests.e2e.common.world import World
 from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Rig
+from tests.kit.limits import PATIENCE_S
 
 NODES, POLICY = "inventory/nodes.yaml", "policy/access-domains.yaml"
 CITY, CITY_ROS = "city", 42
@@ -51,7 +52,7 @@ def world(make_world: MakeWorld, rig: Rig, ros_domain: int) -> Iterator[World]:
     made = make_world()
     made.push(two_domains(made))
     made.generator.start()
-    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=120) as first:
+    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=2 * PATIENCE_S) as first:
         first.put("first", [application("first", point_cloud=POINTS)])  # this applies the policy
         first.release("first")
     domains = made.lay_down(rig, made.manifests(CLUSTER))
@@ -67,7 +68,7 @@ def world(make_world: MakeWorld, rig: Rig, ros_domain: int) -> Iterator[World]:
 
 @pytest.fixture
 def traffic(ros_domain: int) -> Iterator[DemandClient]:
-    with DemandClient("traffic", domain_id=ros_domain, timeout_s=120) as made:
+    with DemandClient("traffic", domain_id=ros_domain, timeout_s=2 * PATIENCE_S) as made:
         yield made
 
 

@@ -9,11 +9,12 @@ import yaml
 
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Kube, Manifest, build_manifest
+from tests.kit.limits import PATIENCE_S
 
 from .expected import CLUSTER
 from .world import World
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = PATIENCE_S
 """How long an answer may wait for what happens by itself."""
 _RBAC = "rbac.authorization.k8s.io"
 _ACCOUNT = "generator"
