@@ -16,7 +16,7 @@ DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
 KILL_TESTS := tests/integration/repo/test_kill_and_restart.py tests/ros/test_crash.py
 # What takes long because it has remotes, crashes, ROS, brokers, servers or much work.
-PROCESS_TESTS := tests/ros tests/experiment tests/unit/decide/test_budget.py \
+PROCESS_TESTS := tests/ros tests/conformance tests/experiment tests/unit/decide/test_budget.py \
   tests/unit/model/test_thousands_of_entries.py $(addprefix tests/integration/,repo mqtt web \
     test_command_line.py test_get.py test_hostile_checkouts.py test_inbound_webhook.py \
     test_person_commands.py test_proposals.py)

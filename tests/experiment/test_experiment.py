@@ -56,7 +56,7 @@ def good() -> Outcome:
             vehicle=VEHICLE,
             joins=event.joins,
             stages={stage: event.at + after for stage, after in stages.items()},
-            bookkeeping=fleet.requesters({VEHICLE} if event.joins else ()),
+            bookkeeping=paper.requesters({VEHICLE} if event.joins else ()),
         )
         for event in events
     ]

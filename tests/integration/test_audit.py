@@ -12,9 +12,9 @@ import pytest
 from demandops.cli.main import run as run_command
 from demandops.model.ledger.claim import read
 
+from tests.golden.cases import GOLDEN, requests_of
 from tests.integration.conftest import On
 from tests.kit.goals import APP, EXPERIMENT, connection, goal
-from tests.kit.golden import GOLDEN, requests_of
 from tests.kit.repo import FORGER, GitRepo, git
 
 ROOT = Path(__file__).parents[2]

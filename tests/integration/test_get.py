@@ -28,6 +28,8 @@ from tests.kit.repo import GitRepo
 
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 NOBODY = "http://127.0.0.1:9"
+LINK = {"id": "patrol/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
+LINK |= {"topics": [{"source": "/patrol"}]}
 
 pytestmark = pytest.mark.usefixtures("fleet")
 
@@ -35,9 +37,7 @@ pytestmark = pytest.mark.usefixtures("fleet")
 @pytest.fixture
 def fleet(on: On, state: GitRepo) -> GitRepo:
     """A state repo with the experiment's first two demands and a demand with a lease."""
-    link = {"id": "patrol/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
-    link |= {"topics": [{"source": "/patrol"}]}
-    leased = put("patrol", "vehicle00", applications=[], connections=[link], lease="10m")
+    leased = put("patrol", "vehicle00", applications=[], connections=[LINK], lease="10m")
     assert on("request", *EXPERIMENT[:2], "-", stdin=yaml.safe_dump(leased)).code == 0
     return state
 

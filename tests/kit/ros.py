@@ -186,6 +186,7 @@ class Client:
     """An action client with its own executor, which spins only while the test waits."""
 
     def __init__(self, domain: int, action: str = DEFAULT_ACTION_NAME) -> None:
+        self.action = action
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = rclpy.create_node("test_client", context=self._context)

@@ -30,8 +30,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import qos_profile_action_status_default
 from rosgraph_msgs.msg import Clock
 
-from examples.experiment import paper
-from tests.kit.goals import experiment
 from tests.kit.goals import link as connection
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import Person, git, hook, tip
@@ -42,27 +40,6 @@ def held_remote(bare: Path) -> str:
     """Return the URL of a repository that delays every push until its folder has a file ``go``."""
     hook(bare, "pre-receive", "for _ in $(seq 4800); do [ -e go ] && exit; sleep 0.05; done")
     return f"file://{bare}"
-
-
-def test_the_eight_steps_of_the_paper_give_its_bookkeeping(serve: Serve, client: Client) -> None:
-    served = serve()
-    client.ready()
-    for step in range(1, 9):
-        answer = client.call(experiment(step))
-        assert answer.status == "succeeded", answer.message
-        word, commit = answer.message.split("\n")[0].split(": ")
-        assert word == ("booked" if step < 5 else "released")
-        stages = ["admitted", "booked", f"committed {commit}", f"pushed {commit}"]
-        if step == 1:  # the node may not have found the client's subscription to feedback yet
-            client.wait(lambda: bool(client.call(experiment(1)).feedback))
-        else:
-            client.wait(lambda: len(answer.feedback) == 4)  # noqa: B023 - feedback may be late
-        assert answer.feedback == stages[4 - len(answer.feedback) :]
-        assert git(served.state_repo, "rev-parse", "main") == commit
-        books = served.bookkeeping()
-        assert paper.observed(books) == paper.expected(step)
-        assert books["commit"] == commit
-    assert git(served.state_repo, "rev-list", "--count", "main") == "9"
 
 
 def test_a_client_that_numbers_its_goals_ends_what_it_joined_if_ids_are_ignored(

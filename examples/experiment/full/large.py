@@ -17,7 +17,8 @@ from typing import Any
 
 import yaml
 
-from . import fleet
+from examples.experiment import paper
+
 from .checks import Check, check_nodes, differ
 from .experiment import Experiment, Say
 from .observers import CloudObserver
@@ -102,7 +103,8 @@ def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
     """Return the requesters while each vehicle is near the intersection of this number."""
     rows: dict[str, list[str]] = {}
     for number, (edge, station) in enumerate(zip(EDGES, STATIONS, strict=True)):
-        rows |= fleet.requesters([one for one, at in inside.items() if at == number], edge, station)
+        near = [vehicle for vehicle, at in inside.items() if at == number]
+        rows |= paper.requesters(near, edge, station)
     return dict(sorted(rows.items()))
 
 

@@ -74,7 +74,9 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
 
 def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
     ends = {"source": connection.source, "target": connection.target}
-    are_known = {*ends.values()} <= config.nodes.keys()  # the admission reports unknown nodes
+    are_known = all(
+        node in config.nodes for node in ends.values()
+    )  # the admission reports unknown nodes
     if kind.image not in config.images:
         message = f"{kind.name} needs an image '{kind.image}'; add it to "
         message += config.place_of(IMAGES_FILE)

@@ -42,7 +42,9 @@ class Mqtt(ConnectionType):
     channel = "MQTT channel"
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        if config.brokers and reader.is_missing(configs.IMAGES_FILE, self.image):
+        if reader.places[configs.BROKERS_FILE] and reader.is_missing(
+            configs.IMAGES_FILE, self.image
+        ):
             message = f"'{self.image}' is missing; add it, because MQTT connections run it"
             yield fault("images", message).within(configs.IMAGES_FILE)
 
@@ -52,7 +54,7 @@ class Mqtt(ConnectionType):
         remedy = f"name one of: {', '.join(sorted(config.brokers))}"
         place = config.place_of(configs.DOMAINS_FILE)
         remedy += f", or ask for a 'broker' of the access domain in {place}"
-        if not config.brokers:
+        if not (config.brokers or config.broker_patterns):
             remedy = f"add one to {config.place_of(configs.BROKERS_FILE)}"
         ends = f"'{connection.target}' or '{connection.source}'"
         message = f"no broker is given, and none runs on {ends}"
@@ -104,7 +106,7 @@ MQTT = Mqtt()
 
 def choose_broker(connection: Connection, config: Config) -> Broker | None:
     # as the reference chooses: the only broker, or else the named one, then that of an end
-    if len(config.brokers) == 1:
+    if len(config.brokers) == 1 and not config.broker_patterns:
         return next(iter(config.brokers.values()))
     ends = (connection.target, connection.source)
     domains = (domain for end in ends if (domain := config.domain_of.get(end)))

@@ -87,7 +87,8 @@ def bookkeeping(world: World) -> Json:
     # of those that declare a capacity, what services request of each resource, and the capacity
     usage, config, nodes = whole_usage(world), world.config, dict[str, dict[str, Json]]()
     # A machine that is in several access domains is one entry, because it has one capacity.
-    machines = {id: node for id, node in config.nodes.items() if id not in config.hosts}
+    used = {*config.nodes, *(node for node, _ in usage.amounts)}
+    machines = {id: config.nodes[id] for id in used - {*config.hosts} if id in config.nodes}
     for id, node in sorted(machines.items()):
         names = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
         limits = ((name, node.most(name)) for name in sorted(names))

@@ -50,7 +50,8 @@ def with_implied_routes(request: AnyDemand, ledger: Ledger, config: Config) -> A
         for flow in flows(config, app):
             # Admission reports an unknown node and a topic that is not valid
             is_valid = (
-                {flow.key.sender, flow.key.receiver} <= config.domain_of.keys()
+                flow.key.sender in config.domain_of
+                and flow.key.receiver in config.domain_of
                 and not topic_problem(flow.key.topic)
                 and not topic_problem(flow.key.target)
             )

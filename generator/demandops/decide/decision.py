@@ -493,7 +493,7 @@ def may_demand(
         if word and word not in known:
             raise Refused.at(field, f"'{word}' is not known{suggestion(word, known)}")
     answer = Answer(node, (fault("node", "no node is in an access domain"),), (), ())
-    for name in [node] if node else sorted(config.domain_of):
+    for name in [node] if node else [*sorted(config.domain_of), *config.example_nodes()]:
         held = Application(f"may/{requester}", appdef, name, version=version)
         demanded = (Item(held, (requester,)),)
         demand = Demand("put", "may", demanded, f"may/{requester}", (requester,))

@@ -282,7 +282,7 @@ def request_warnings(config: Config) -> Iterator[Fault]:
             is_usual = name in ("cpu", "memory")
             if not any(
                 is_usual if most is None else most >= amount_of(amount)
-                for most in (node.most(name) for node in config.nodes.values())
+                for most in (node.most(name) for node in config.kinds_of_nodes())
             ):
                 message = (
                     f"service '{service.name}' requests {known}; no node of the inventory has as "
@@ -312,8 +312,9 @@ def request_warnings(config: Config) -> Iterator[Fault]:
                 yield fault("", message).within(template)
 
 
-_TRUTH = re.compile(
-    r"(?:^|[:,\[{-])[ ]*\b([yY]|[nN]|[yY]es|YES|[nN]o|NO|[oO]n|ON|[oO]ff|OFF)[ ]*(?=[,\]}]|$)"
+_TRUTH = re.compile(  # a brace inside a text is that of a placeholder: vehicle{n}
+    r"(?:^|[:,\[-]|(?<![^\s\[{,:-])\{)[ ]*"
+    r"\b([yY]|[nN]|[yY]es|YES|[nN]o|NO|[oO]n|ON|[oO]ff|OFF)[ ]*(?=[,\]}]|$)"
 )
 
 
@@ -337,9 +338,10 @@ def truth_warnings(files: Mapping[str, str]) -> Iterator[Fault]:
 
 
 def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
-    nodes = tuple(sorted(config.nodes))
+    kinds_of_nodes = sorted(config.kinds_of_nodes(), key=lambda node: node.id)
+    nodes = tuple(node.id for node in kinds_of_nodes)
     for name, domain in sorted(config.domains.items()):
-        own = tuple(sorted(id for id, of in config.domain_of.items() if of.name == name))
+        own = tuple(node.id for node in kinds_of_nodes if domain in config.domains_at(node))
         others = tuple(sorted(config.domains.keys() - {name}))
         # (where, patterns, what the patterns may match, all names that they may match)
         kinds = [("nodes", domain.nodes, "node", nodes)]
@@ -430,9 +432,10 @@ def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
     nodes = [
-        (config.domain_of[node.id].name, node)
-        for node in config.nodes.values()
-        if node.host_network and node.id in config.domain_of
+        (domain.name, node)
+        for node in config.kinds_of_nodes()
+        if node.host_network
+        for domain in config.domains_at(node)
     ]
     nodes.sort(key=lambda pair: (pair[0], pair[1].id))
     # Kubernetes applies a NetworkPolicy only to pods with their own network.
@@ -450,7 +453,8 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
             yield fault("", message).within(config.file_of(DOMAINS_FILE, name))
     graphs: dict[tuple[str, int], dict[str, None]] = {}
     for name, node in nodes:
-        graphs.setdefault((node.cluster, node.ros.domain_id), {})[name] = None
+        ros = config.domains[name].ros or node.ros
+        graphs.setdefault((node.cluster, ros.domain_id), {})[name] = None
     for (cluster, number), names in sorted(graphs.items()):
         if len(names) > 1:
             listed = " and ".join(f"'{name}'" for name in names)

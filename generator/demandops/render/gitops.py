@@ -16,6 +16,7 @@ from demandops.base.errors import InvalidInput, Refused
 from demandops.base.settings import MAIN_BRANCH
 from demandops.connections.connection import UNSUPPORTED
 from demandops.model.config.config import IMAGES_FILE, Config
+from demandops.model.config.entry_patterns import any_value_of, is_pattern
 from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.override import format_time
 from demandops.model.config.policy import AccessDomain
@@ -52,9 +53,9 @@ def bootstrap_path(cluster: str) -> str:
 def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
     """Return (cluster, access domain) for each domain with nodes in the cluster, sorted."""
     pairs = {
-        (node.cluster, config.domain_of[node.id].name)
-        for node in config.nodes.values()
-        if node.id in config.domain_of
+        (node.cluster, domain.name)
+        for node in config.kinds_of_nodes()
+        for domain in config.domains_at(node)
     }
     return [(cluster, config.domains[name]) for cluster, name in sorted(pairs)]
 
@@ -258,12 +259,18 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
     """Return the expression that is true for the selectors of the domain's nodes."""
     by_label: dict[str, set[str]] = {}
     selectors: set[tuple[tuple[str, str], ...]] = set()
-    for node in config.nodes.values():
+    by_pattern = list[str]()
+    for node in config.kinds_of_nodes():
         if node.selector is None or node.cluster != cluster:
             continue
-        if config.domain_of.get(node.id) is not domain:
+        if domain not in config.domains_at(node):
             continue
-        if len(node.selector) == 1:
+        if is_pattern(node.id):
+            (entry,) = (each for each in config.node_patterns if each.id == node.id)
+            written = entry.data["selector"].items()
+            tests = [_has(k, f".matches({_text(f'^{any_value_of(v)}$')})") for k, v in written]
+            by_pattern.append(f"({' && '.join(tests) or 'true'})")
+        elif len(node.selector) == 1:
             ((label, value),) = node.selector.items()
             by_label.setdefault(label, set()).add(value)
         else:
@@ -277,7 +284,7 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
     for selector in sorted(selectors):
         labels = " && ".join(_has(label, f" == {_text(value)}") for label, value in selector)
         parts.append(f"({labels or 'true'})")  # a node with ``selector: {}`` takes every pod
-    return " || ".join(parts)
+    return " || ".join((*parts, *sorted(by_pattern)))
 
 
 def expression_of(pattern: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
@@ -19,6 +20,7 @@ from demandops.decide.booking import Restoration
 from demandops.decide.changeset import FileReader
 from demandops.decide.state import rendered_files
 from demandops.model.config.config import Config
+from demandops.model.config.override import OVERRIDES_ROOT, override_selects
 from demandops.model.demand.demand import Rollback
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import verification
@@ -213,8 +215,8 @@ class Reader:
     def release_path(self, name: str, revision: str) -> str | None:
         return commit_log.release_path(self._objects, revision, name)
 
-    def stopped_release_names(self, revision: str) -> set[str]:
-        return commit_log.stopped_release_names(self._objects, revision)
+    def stopped_releases(self, revision: str) -> dict[str, list[str]]:
+        return commit_log.stopped_releases(self._objects, revision)
 
     def changed_files(self, before: str, after: str, roots: Sequence[str] = ()) -> list[str]:
         changed = trees.differences(self._tree(before), self._tree(after), roots)
@@ -250,6 +252,27 @@ class Reader:
         claims = (valid_claim_at(tree, path) for path in paths for tree in (before, after))
         return any(claim is not None and claim.held.needs(node) for claim in claims)
 
+    def edits(self, entry: LogEntry, kind: str, name: str) -> bool:
+        """Return whether a commit changes an override that selects a thing, or a node's entry.
+
+        It is by a person, or by a generator that ends an override.
+        """
+        if entry.by_generator and entry.first("Operation") != "expire-override":
+            return False
+        commit = trees.commit_of(self._objects, entry.commit)
+        sides = trees.parent_tree(commit), commit.tree
+        roots = (OVERRIDES_ROOT, "inventory") if kind == "node" else (OVERRIDES_ROOT,)
+        paths = {path for path, _ in trees.differences(*sides, roots)}
+        for path in paths | {*entry.trailers.get("Override", ())}:
+            texts = [trees.read_text(side, path) or "" for side in sides]
+            if path.startswith(f"{OVERRIDES_ROOT}/"):
+                if any(override_selects(text, kind, name) for text in texts):
+                    return True
+            # as text, because a large inventory takes long to parse, and has many versions
+            elif len({_item(text, name) for text in texts}) > 1:
+                return True
+        return False
+
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
         since, follows = entry.first("Since"), entry.first("Follows")
         if not (entry.by_generator and since and follows):
@@ -262,6 +285,12 @@ class Reader:
 
     def operator(self) -> Person:
         return commit_log.operator(self._objects.path)
+
+
+def _item(text: str, id: str) -> str:
+    named = re.compile(rf"\bid: *['\"]?{re.escape(id)}(?![\w/.-])")
+    items = re.split(r"(?m)^(?=\s*- )", text)
+    return next((item.strip() for item in items if named.search(item)), "")
 
 
 @contextmanager

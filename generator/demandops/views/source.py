@@ -37,6 +37,7 @@ from demandops.decide.planning.planner import denied_release, plan
 from demandops.decide.planning.release_keys import ReleaseKey, takes
 from demandops.decide.state import State
 from demandops.model.config.config import Config
+from demandops.model.config.inventory import Node
 from demandops.model.config.override import Override
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger, World, changes_on
@@ -145,6 +146,13 @@ class Source:
         problems, remedy = reader.problems_of(snapshot), reader.how_to_mend(snapshot)
         own = reader.for_another_thread
         return cls(snapshot, entry, REAL.now(), own, problems, remedy, **more)
+
+    @property
+    def nodes(self) -> Mapping[str, Node]:
+        """The listed nodes, and those of patterns that claims need."""
+        known = self.config.nodes
+        used = self.state.ledger.indexed_names("node") if self.config.node_patterns else set()
+        return {**known, **{id: known[id] for id in used if id in known}}
 
     def taking_over(self, before: Source) -> Source:
         """Plan only what may differ from an earlier source; its other releases and rows are kept.

@@ -121,7 +121,7 @@ class Line:
 def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
     # A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a
     # position.
-    known = source.config.nodes
+    known = source.nodes
     nodes = sorted(known.values(), key=lambda node: (node.cluster, node.id))
     spots = _spots(nodes)
     layouts = ("cluster", "place") if spots else ("cluster",)

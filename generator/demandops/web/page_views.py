@@ -124,7 +124,7 @@ def _figures(asked: ViewRequest, events: list[Event]) -> list[Data]:
         what = Part(name.removesuffix("s") if len(rows) == 1 else name, name)
         figures.append({"count": len(rows), "what": what, "parts": parts})
     used = [row for row in asked.rows("nodes") if row.item["demands"] and row.item["type"]]
-    what = Part(f"of {len(source.config.nodes)} nodes used", "nodes")
+    what = Part(f"of {len(source.nodes)} nodes used", "nodes")
     figures.append({"count": len(used), "what": what, "parts": ()})
     proposed = len(source.proposals)
     waiting = sum(row.item["state"] == "waiting" for row in demands)

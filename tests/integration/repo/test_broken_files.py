@@ -114,29 +114,6 @@ def test_a_merge_of_any_style_is_judged_and_so_is_a_second_one_of_the_same_branc
     assert differing(bare) == {}
 
 
-def test_a_pull_that_makes_main_the_second_parent_stops_no_demand(
-    bare: Path, person: Person
-) -> None:
-    """No trailer shows that what was merged before was in effect, so what was before it is."""
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-        person.write({"overrides/broken.yaml": BROKEN})
-        for command in ("add .", "commit -q -m Mine"):
-            rig.git(person.folder, *command.split())
-        node = {"id": "one", "type": "vehicle", "cluster": "c-its"}
-        nodes = {"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": [node]}
-        merged = person.change({"inventory/nodes/one.yaml": yaml.safe_dump(nodes)})
-        generator.fetch_now()
-        rig.wait_until(lambda: includes(generator, merged), "it is followed")
-        rig.git(person.folder, "pull", "-q", "--no-rebase", "--no-edit")
-        rig.git(person.folder, "push", "-q", "origin", "HEAD:main")
-        rig.book(generator, goal(2))
-        assert [one.file for one in generator.snapshot.problems] == ["overrides/broken.yaml"]
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(3))
-    assert differing(bare) == {}
-
-
 CLUSTERS = "inventory/clusters.yaml"
 MISTAKES: dict[str, list[tuple[str, str, str]]] = {
     "a later commit changed the same file": [
@@ -377,51 +354,6 @@ def test_a_submodule_in_place_of_a_claim_releases_nothing(generator: Generator, 
     rig.book(generator, goal(3))
     assert text(bare, path) == whole
     rig.assert_sound(bare)
-
-
-def test_a_commit_that_follows_one_that_is_gone_does_not_end_the_verification(
-    generator: Generator, bare: Path, person: Person
-) -> None:
-    rig.book(generator, goal(1))
-    gone = f"Operation: follow\nSince: {'1' * 40}\nRender-Version: 3"
-    person.change({"README.md": "x"}, f"x\n\nWhy: x\n\n{gone}", FORGER)
-    rig.book(generator, goal(2))
-    with reader.opened(str(bare)) as repo:
-        verdicts = repo.verify(repo.revisions(f"{rig.root(bare)}.."))
-    assert [verdict.holds for verdict in verdicts] == [True, False, True]
-
-
-def test_a_forged_commit_with_an_invalid_claim_stops_no_demand(
-    address: str, bare: Path, person: Person
-) -> None:
-    """Only a person who writes the generator's name into a commit makes such a claim."""
-    with rig.running(address) as generator:
-        rig.book(generator, goal(1), goal(2))
-        (path,) = rig.claims(bare, "fusion-1")
-        whole = text(bare, path)
-        person.change({path: "kind: 5\n"}, "x\n\nWhy: x\n\nRender-Version: 3", FORGER)
-        person.change({path: "kind: 6\n"})
-        rig.book(generator, goal(3))
-        assert text(bare, path) == whole
-        person.change({path: "kind: 5\n"}, "x\n\nWhy: x\n\nRender-Version: 3", FORGER)
-    with rig.running(address) as generator:
-        rig.book(generator, goal(4))
-        assert text(bare, path) == whole
-
-
-def test_a_generator_that_finds_invalid_what_another_has_in_effect_refuses_demands(
-    bare: Path, person: Person
-) -> None:
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-        # as a newer program would commit it, which knows the field
-        new = {IMAGES: tagged(bare, "v2", "NewImages")}
-        person.change(new, "x\n\nWhy: x\n\nOperation: follow\nRender-Version: 3", FORGER)
-        with pytest.raises(StateRepoError, match="update this generator"):
-            generator.submit(goal(2)).future.result(rig.PATIENCE_S)
-        person.change({IMAGES: tagged(bare, "v3")})
-        rig.book(generator, goal(3))
-        assert values(bare)[0] == "v3"
 
 
 def test_after_people_squash_a_history_that_is_not_valid_demands_wait_for_valid_files(

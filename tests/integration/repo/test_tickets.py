@@ -23,7 +23,7 @@ from tests.kit import rig
 from tests.kit.clock import Clock
 from tests.kit.goals import put
 from tests.kit.limits import files_end_at
-from tests.kit.rig import Drivers, demand, goal
+from tests.kit.rig import goal
 
 # ---- withdrawals ----
 
@@ -53,20 +53,6 @@ def test_a_demand_can_be_taken_back_until_it_is_committed(
         rig.book(generator, goal(2))
     booked = [goal(1)] if outcome == "booked" else []
     assert rig.books(bare) == rig.books_after([*booked, goal(2)])
-
-
-def test_taking_back_races_with_committing_and_both_agree_on_who_won(
-    bare: Path, address: str
-) -> None:
-    with rig.running(address) as generator:
-        tickets = [generator.submit(goal(n), f"op-{n}") for n in range(30)]
-        taken = {n for n in range(29, -1, -1) if generator.withdraw(f"op-{n}")}
-        outcomes = [rig.outcome(ticket) for ticket in tickets]
-    assert outcomes == ["Withdrawn" if n in taken else "booked" for n in range(30)]
-    kept = [n for n in range(30) if n not in taken]
-    assert rig.operations(bare) == [f"op-{n}" for n in kept]
-    assert rig.books(bare) == rig.books_after(map(goal, kept))
-    rig.assert_sound(bare)
 
 
 # ---- closing ----
@@ -318,19 +304,3 @@ def test_nobody_is_answered_after_a_journal_may_hold_what_it_refused(bare: Path)
 
 
 # ---- what was promised holds after a crash ----
-
-
-@pytest.mark.synced
-def test_a_withdrawn_demand_stays_withdrawn_after_a_crash(
-    drivers: Drivers, address: str, bare: Path
-) -> None:
-    """The kill comes when both demands are in the journal and the second is withdrawn."""
-    lanes = [[demand("first", goal(1))], [demand("second", goal(2)) | {"withdraw": True}]]
-    told = drivers.start(
-        address, lanes, opening=demand("opening", goal(0)), die_at="withdrawn"
-    ).listen()
-    assert told.finished is None
-    assert told.withdrawn == ["second"]
-    assert rig.restart(address) is True
-    assert sorted(rig.operations(bare)) == ["op-first", "op-opening"]
-    rig.assert_sound(bare)

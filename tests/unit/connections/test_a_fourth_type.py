@@ -133,17 +133,6 @@ def test_a_demand_for_it_becomes_a_claim_and_a_client(kind: str) -> None:
     assert (release.change, release.what) == ("start", "relay on edge")
 
 
-def test_a_further_connection_changes_the_shared_client_by_the_facts_that_it_adds() -> None:
-    world, _ = booked()
-    other = demand("relay", {"/c": "/c"}, id="d", source="vehicle01")
-    (release,) = world.send(routes(other)).releases
-    assert (release.name, release.change) == ("relay-edge", "change")
-    assert release.details == ("+ fetches /c as /c",)
-    world.send(routes(other | {"shutdown": True}))
-    world.send(routes(demand("relay") | {"shutdown": True}))
-    assert world.objects("Deployment") == {}
-
-
 def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
     world, _ = booked()
     ledger = world.state.ledger

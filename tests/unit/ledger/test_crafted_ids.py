@@ -27,7 +27,6 @@ from demandops.model.config.load import load
 from demandops.model.demand.demand import Requirement
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger import records
-from demandops.model.ledger.claim import demand_id
 from demandops.model.ledger.ledger import Changes
 from demandops.model.ledger.records import Wait, WaitingDemand
 from hypothesis import given
@@ -144,13 +143,6 @@ def test_whatever_the_ids_each_has_its_own_names_and_files_or_is_refused(
         repo.take(end_of(request))
 
 
-def conflicts(repo: MemoryRepo, asked: Goal) -> list[str]:
-    taken = repo.take(asked)
-    assert isinstance(taken, Refused)
-    assert {fault.code for fault in taken.faults} == {"conflict"}
-    return [fault.message for fault in taken.faults]
-
-
 def rival(id: str, name_of: Callable[[str], str]) -> str:
     """Return another id with the same name."""
     others = (f"{id}/{'-' * number}" for number in range(1, 1000))
@@ -241,19 +233,3 @@ def test_no_two_releases_of_one_name_are_rendered(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(Refused) as refused:
         rendered_files(repo.state)
     assert {fault.code for fault in refused.value.faults} == {"conflict"}
-
-
-@pytest.mark.usefixtures("short_digests")
-def test_two_demands_without_an_id_have_two_digests() -> None:
-    def joining(request: str, requester: str) -> Goal:
-        return goal([application(f"edge/{requester}", who=[requester])], id=request)
-
-    repo, first = MemoryRepo(), "visit"
-    known = demand_id(first, ["vehicle00"])
-    others = (f"visit-{number}" for number in range(1000))
-    other = next(one for one in others if demand_id(one, ["vehicle01"]) == known)
-    repo.send(joining(first, "vehicle00"))
-    assert len(conflicts(repo, joining(other, "vehicle01"))) == 1
-    assert repo.send(joining(first, "vehicle00")).outcome == "unchanged"
-    repo.send(joining(first, "vehicle00") | {"shutdown": True})
-    assert repo.send(joining(other, "vehicle01")).outcome == "booked"

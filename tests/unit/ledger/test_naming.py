@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples, told, visible
-from tests.kit.goals import EGO, application, connection, goal
+from tests.kit.goals import application, connection, goal
 from tests.kit.memory import MemoryRepo
 
 DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
@@ -31,7 +31,10 @@ Subject = tuple[str, ...]
 """What a name is made from: a prefix, and ids or topics."""
 
 close = st.text("ab0-_/.A", min_size=1, max_size=5)
-words = st.sampled_from(["edge", "vehicle00", "vehicle_00", "vehicle/00", "Vehicle00", "a", "b"])
+words = st.sampled_from(
+    ["edge", "vehicle00", "vehicle_00", "vehicle/00", "Vehicle00", "a", "a-watcher"]
+)
+watched = st.sampled_from(["a-watcher", "edge-watcher", "b"])
 hashed = st.builds(
     "{}{}{}".format,
     st.sampled_from(["", "a", "edge", "edge/a"]),
@@ -45,7 +48,9 @@ long = st.builds(
     st.sampled_from(["", "a", "b", "-", "_a"]),
 )
 anything = st.text(visible, min_size=1, max_size=12)
-ids = st.one_of(words, close, hashed, long, anything).filter(lambda text: not id_problem(text))
+ids = st.one_of(words, watched, close, hashed, long, anything).filter(
+    lambda text: not id_problem(text)
+)
 topics = st.from_regex(r"(/[ab_][a0_]{0,3}){1,3}", fullmatch=True) | st.builds(
     lambda part, count: f"/{part}" * count, st.sampled_from(["a", "b_0", "a_"]), st.integers(50, 60)
 )
@@ -176,6 +181,8 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
     assert len(taken.releases) == len({release.name for release in taken.releases}) == releases
     manifests = [*repo.rendered().values()]
     assert len(manifests) == releases
+    names = [name for text in manifests for name in re.findall(r"nodeName: (\S+)", text)]
+    assert len({*names}) == len(names), "a service and a watcher have one name"
     lowered = [path.lower() for path in taken.files]
     assert len(set(lowered)) == len(lowered), "a file system that ignores case would confuse them"
     assert all(len(part) <= 100 for path in taken.files for part in path.split("/"))
@@ -187,17 +194,6 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
     shutdown = repo.take({**request, "shutdown": True})
     assert isinstance(shutdown, Decision), shutdown
     assert repo.files == with_nodes(nodes).files
-
-
-def test_the_watcher_of_one_application_is_not_named_like_the_fusion_of_another() -> None:
-    repo = MemoryRepo()
-    repo.send(goal([application(id_, ego=[EGO], clouds=[]) for id_ in ("x", "x-watcher")]))
-
-    texts = repo.below("clusters").values()
-    names = [name for text in texts for name in re.findall(r"nodeName: (\S+)", text)]
-
-    assert len(names) == 4
-    assert len(set(names)) == 4, names
 
 
 def usual_cloud(nodes: list[str], node: str) -> str:

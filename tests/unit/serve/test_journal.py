@@ -12,8 +12,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import pygit2
 import pytest
 from demandops.base.errors import StateRepoError
+from demandops.repo import new_repo
 from demandops.repo.slot import Slot
 from demandops.serve.journal import (
     DamagedJournal,
@@ -24,8 +26,8 @@ from demandops.serve.journal import (
     read,
 )
 
-from tests.kit.goals import perception
 from tests.kit.limits import files_end_at
+from tests.kit.memory import NOW
 from tests.kit.rig import journaled
 
 PROPOSAL = ProposalRecord("demand/x", ("a",))
@@ -223,45 +225,25 @@ def test_a_line_that_the_first_version_did_not_write_is_damage(line: bytes) -> N
         pending(of_the_first_version(WAITING) + line + of_the_first_version(PROPOSED))
 
 
-PROGRAM = """
-import json, os, sys
-from datetime import datetime, timezone
-from pathlib import Path
+LOADING = """
 import pygit2
-from pygit2.enums import Option
-
-calls = []
-
-def recorded(owner, name):
-    known = getattr(owner, name)
-    def call(*args):
-        calls.append([name, *map(int, args)])
-        return known(*args)
-    setattr(owner, name, call)
-
-recorded(pygit2, "option")
-from demandops.serve.generator import Generator
-from demandops.repo import new_repo
-
-bare = Path(sys.argv[1])
-new_repo.init(bare, datetime.now(timezone.utc), bare=True, gitops="flux")
-generator = Generator(str(bare))
-recorded(os, "fdatasync")
-before = []
-goal = json.loads(sys.argv[2])
-ticket = generator.submit(goal, "op", lambda stage, text: before.append((stage, calls[-1][0])))
-ticket.future.result(240)
-generator.close()
-setting = pygit2.Repository(str(bare)).config["core.fsync"]
-options = [call[2:] for call in calls if call[:2] == ["option", Option.ENABLE_FSYNC_GITDIR]]
-print(json.dumps([options, setting, dict(before)["admitted"]]))
+calls, known = [], pygit2.option
+pygit2.option = lambda *args: calls.append([*map(int, args)]) or known(*args)
+from demandops.serve import generator
+print(*[call[1:] for call in calls if call[0] == pygit2.enums.Option.ENABLE_FSYNC_GITDIR])
 """
 
 
-def test_libgit2_git_and_the_journal_force_their_writes(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", PROGRAM, str(tmp_path / "state.git"), json.dumps(perception())]
+@pytest.mark.synced
+def test_libgit2_git_and_the_journal_force_their_writes(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = [sys.executable, "-c", LOADING]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    options, setting, last_call = json.loads(said)
-    assert options == [[1]], "libgit2's forced writes must be switched on once, and never off"
-    assert setting == "committed"
-    assert last_call == "fdatasync", "the journal must be on the disk before a demand is admitted"
+    assert said == "[1]\n", "libgit2's forced writes must be switched on once, and never off"
+    new_repo.init(tmp_path / "made", NOW, bare=True, gitops="flux")
+    assert pygit2.Repository(str(tmp_path / "made")).config["core.fsync"] == "committed"
+    forced, force = list[int](), os.fdatasync
+    monkeypatch.setattr(os, "fdatasync", lambda file: forced.append(file) or force(file))
+    Journal(path).append([entry("a")])
+    assert forced, "a demand must be on the disk before it is admitted"

@@ -314,7 +314,7 @@ def _lines(checked: CheckResult) -> Iterator[str]:
     if consequence and (consequence.files or checked.bookkeeping):
         compared = f", compared with {checked.base[:10]}" if checked.base else ""
         yield f"\nwhat merging would do{compared}:"
-    if checked.base and not checked.base_valid:
+    if consequence and checked.base and not checked.base_valid:
         yield f"({checked.base[:10]} is not valid, so what is in effect at it is compared)"
     for section in sections[len(checked.suggestions) :]:
         yield from section.text()

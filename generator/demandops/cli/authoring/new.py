@@ -290,7 +290,8 @@ def application(  # noqa: PLR0913 - as many as options
     types = dict(_read("--input", word) for word in values["--input"])
     pulled = _read("--image", values["--image"][0])
     # a demand can name only nodes in an access domain
-    nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
+    known = (*config.domain_of, *config.example_nodes())
+    nodes = sorted(known, key=lambda id: (config.nodes[id].type != "edge", id))
     if not (node or nodes):
         raise StateRepoError(
             "the inventory has no node in an access domain, so no demand can be made; add one "

@@ -346,6 +346,12 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
         host, verb = config.host_of(node), "Drain" if drained else "Undrain"
         if config.nodes[host].drained is drained:
             raise StateRepoError(f"'{host}' is {'drained already' if drained else 'not drained'}")
+        if host not in config.entry_files[NODES_FILE]:
+            message = (
+                f"'{host}' is not listed: a pattern in {config.place_of(NODES_FILE)} gives it; "
+                "list it there, with what it shall have of its own"
+            )
+            raise StateRepoError(message)
         path = config.file_of(NODES_FILE, host)
         text = repo.file_reader()(path) or ""
         try:
@@ -393,7 +399,7 @@ def drain(node: str, options: Options) -> None:
 def undrain(node: str, options: Options) -> None:
     """Use a drained node again.
 
-    The command sets `drained: false` in the inventory. What was moved away stays where it is.
+    The command takes `drained: true` out of the inventory. What was moved away stays where it is.
 
     \b
     Examples:

@@ -232,27 +232,26 @@ def _connection_faults(connection: Connection, config: Config, claiming: bool) -
         yield from _node_faults(end, node, config)
     if connection.type is not None:
         yield from connection_types.type_faults(connection.type, connection, config)
-    elif {*connection.nodes} <= config.nodes.keys() and connection_types.choose_type(
-        connection, config
-    ) is None:
+    elif all(node in config.nodes for node in connection.nodes) and (
+        connection_types.choose_type(connection, config) is None
+    ):
         yield connection_types.no_type_fault(connection, config)
 
 
 def _node_faults(where: str, node: str, config: Config) -> Iterator[Fault]:
     # an empty node is reported as an empty id
     if node and node not in config.nodes:
-        yield fault(
-            where,
-            f"{quoted(node)} is not in {config.place_of(NODES_FILE)}"
-            + suggestion(node, config.nodes),
-            code="unknown-node",
+        problem = config.unlisted.why_not(node) or (
+            f"is not in {config.place_of(NODES_FILE)}"
+            + suggestion(node, (each.id for each in config.kinds_of_nodes()))
         )
+        yield fault(where, f"{quoted(node)} {problem}", code="unknown-node")
     elif node and node not in config.domain_of:
-        message = (
-            f"{quoted(node)} is not in any access domain; a platform engineer adds it to "
+        problem = config.unlisted.why_not(node) or (
+            "is not in any access domain; a platform engineer adds it to "
             f"{config.place_of(DOMAINS_FILE)}"
         )
-        yield fault(where, message, code="no-access-domain")
+        yield fault(where, f"{quoted(node)} {problem}", code="no-access-domain")
 
 
 def _id_faults(where: str, value: str) -> Iterator[Fault]:

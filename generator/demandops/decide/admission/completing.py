@@ -111,7 +111,7 @@ def with_chosen_domains(
     request: AnyDemand, config: Config, ledger: Ledger
 ) -> tuple[AnyDemand, list[Fault]]:
     """Choose a domain for each node; a node that may be used in several domains is a fault."""
-    if not config.hosts:
+    if not (config.hosts or config.node_patterns):
         return request, []
     faults: list[Fault] = []
 

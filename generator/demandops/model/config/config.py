@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -19,6 +19,12 @@ from demandops.model.config.appdef import (
     Services,
 )
 from demandops.model.config.base_model import DnsLabel, faults_of, parse, parse_file
+from demandops.model.config.entry_patterns import (
+    NOTHING_UNLISTED,
+    EntryPattern,
+    UnlistedNodes,
+    is_pattern,
+)
 from demandops.model.config.inventory import Broker, Cluster, Kind, Node, id_in_domain, kind_of
 from demandops.model.config.override import OVERRIDES_ROOT, Override
 from demandops.model.config.policy import AccessDomain
@@ -40,6 +46,9 @@ COLLECTIONS = (
     CLIENTS_FILE := "registry/clients.yaml",
     VERSIONS_FILE := "registry/versions.yaml",
 )
+
+# An entry of these may stand for each one whose id it matches (`entry_patterns`)
+_WITH_PATTERNS = (NODES_FILE, BROKERS_FILE)
 
 # The top-level entries of a state repo that hold the configuration, which people write
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
@@ -81,6 +90,10 @@ class Config:
     hosts: Mapping[str, str] = field(default_factory=dict)
     # Every override; `demandops.model.ledger.ledger.World` knows which of them have ended
     overrides: Mapping[str, Override] = field(default_factory=dict)
+    # The nodes and brokers whose id is a pattern
+    node_patterns: tuple[EntryPattern[Node], ...] = ()
+    broker_patterns: tuple[EntryPattern[Broker], ...] = ()
+    unlisted: UnlistedNodes = field(default=NOTHING_UNLISTED, compare=False, repr=False)
     clients: ClientsFile = registry.DEFAULT_SETTINGS
     versions: Mapping[str, registry.VersionList] = field(default_factory=dict)
     # For each collection, a map from each entry to the file that has the entry
@@ -107,10 +120,10 @@ class Config:
 
     def __post_init__(self) -> None:
         by_kind: dict[str, dict[Kind, list[str]]] = {}
-        for id, node in self.nodes.items():
+        for node in self.kinds_of_nodes():
             for name, value in node.properties.items():
                 ids_by_kind = by_kind.setdefault(name, {})
-                ids_by_kind.setdefault(kind_of(value) or "text", []).append(id)
+                ids_by_kind.setdefault(kind_of(value) or "text", []).append(node.id)
         kinds = {
             name: max(ids_by_kind.items(), key=lambda kind_and_ids: len(kind_and_ids[1]))
             for name, ids_by_kind in by_kind.items()
@@ -128,7 +141,7 @@ class Config:
             "nodes_with": {trait: tuple(nodes) for trait, nodes in by_trait.items()},
             "property_kinds": {name: (kind, ids[0]) for name, (kind, ids) in kinds.items()},
             "drained_nodes": tuple(sorted(id for id, node in self.nodes.items() if node.drained)),
-            "limits_capacity": any(node.capacity is not None for node in self.nodes.values()),
+            "limits_capacity": any(node.capacity is not None for node in self.kinds_of_nodes()),
             "roles_with_services": tuple(sorted({s.root for s in services if s.root})),
             "application_versions": {name: self._versions(name) for name in self.services},
         }
@@ -153,6 +166,22 @@ class Config:
         versions = {name: version(name, v.charts, v.images) for name, v in listed.versions.items()}
         channels = {"": listed.default, **listed.channels}
         return versions | {channel: versions[name] for channel, name in channels.items()}
+
+    def kinds_of_nodes(self) -> Iterator[Node]:
+        """Yield each listed node, and for each pattern one that stands for all its nodes."""
+        yield from self.nodes.values()
+        yield from (pattern.example() for pattern in self.node_patterns)
+
+    def example_nodes(self) -> Iterator[str]:
+        """Yield for each pattern an id of a node in an access domain, as far as it is found."""
+        for pattern in self.node_patterns:
+            yield from (id for id in pattern.example_ids() if id in self.domain_of)
+
+    def domains_at(self, node: Node) -> list[AccessDomain]:
+        """Return the access domain of a node, or each that nodes of a pattern may be in."""
+        if is_pattern(node.id):
+            return self.unlisted.possible_domains(node.id)
+        return [self.domain_of[node.id]] if node.id in self.domain_of else []
 
     def host_of(self, node: str) -> str:
         # `edge` for `edge@city`
@@ -204,6 +233,8 @@ class ConfigReader:
         self.places: dict[str, dict[str, tuple[str, str]]] = {}
         # The collections with items that are not valid
         self.incomplete: set[str] = set()
+        # The valid entries whose id is a pattern, by collection
+        self.patterns = defaultdict[str, list[EntryPattern[Any]]](list)
         # The valid files with items, but without the items
         self.heads: dict[str, BaseModel] = {}
 
@@ -259,6 +290,16 @@ class ConfigReader:
                 if isinstance(name, str) and name in places:
                     self.add_duplicate(name, places[name], (file, field_path(at)), key)
                     continue
+                if collection in _WITH_PATTERNS and is_pattern(name):
+                    pattern = EntryPattern(name, key, item, entry, file, at)
+                    places[name] = (file, field_path(at))
+                    try:
+                        pattern.example()
+                        self.patterns[collection].append(pattern)
+                    except InvalidInput as error:
+                        self.faults += error.faults
+                        self.incomplete.add(collection)
+                    continue
                 parsed = self._valid(item.model_validate, entry, item, file, at)
                 label = key or self._valid(_NAME.validate_python, name, item, file, at)
                 if parsed is None or label is None:
@@ -281,8 +322,9 @@ class ConfigReader:
             self.add_fault(file, f"{place}{dot_key}", f"'{name}' is in {other} too; remove one")
 
     def is_missing(self, collection: str, name: str) -> bool:
-        # an invalid item may be the missing one, and has faults of its own
-        return collection not in self.incomplete and name not in self.places[collection]
+        if collection in self.incomplete or name in self.places[collection]:
+            return False  # an invalid item may be the missing one, and has faults of its own
+        return not any(pattern.values(name) for pattern in self.patterns[collection])
 
     def check_reference(self, file: str, field: str, name: str, collection: str) -> None:
         if self.is_missing(collection, name):

@@ -34,7 +34,7 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
 def _check_inventory(config: Config, reader: ConfigReader) -> None:
     roles = {role for appdef in config.appdefs.values() for role in appdef.inputs}
     folders: dict[str, str] = {}
-    for node in config.nodes.values():
+    for node in config.kinds_of_nodes():
         file, place = reader.places[configs.NODES_FILE][node.id]
         other = folders.setdefault(folder := naming.object_name("", node.id), node.id)
         if other != node.id:
@@ -54,7 +54,8 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
             if roles and role not in roles:
                 message = f"'{role}' is not an input of any application{suggestion(role, roles)}"
                 reader.add_fault(file, f"{place}.topics.{role}", message)
-    for broker in config.brokers.values():
+    examples = (pattern.example() for pattern in config.broker_patterns)
+    for broker in (*config.brokers.values(), *examples):
         file, place = reader.places[configs.BROKERS_FILE][broker.node]
         reader.check_reference(file, f"{place}.node", broker.node, configs.NODES_FILE)
 
@@ -85,9 +86,9 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(file, f"{place}.namespace", message)
         if domain.pod_security == "baseline":
             closed = closed or domain.name
-    for node in config.nodes.values():
-        owner = config.domain_of.get(node.id)
-        if owner and owner.pod_security == "baseline" and node.host_network:
+    for node in config.kinds_of_nodes():
+        strict = (d for d in config.domains_at(node) if d.pod_security == "baseline")
+        if node.host_network and (owner := next(strict, None)):
             file, place = reader.places[configs.NODES_FILE][node.id]
             message = (
                 f"is true (the default), and podSecurity of access domain '{owner.name}' is "

@@ -7,8 +7,7 @@ every fault of every file.
 from __future__ import annotations
 
 import re
-from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import TypeVar
@@ -27,6 +26,7 @@ from demandops.model.config.appdef import (
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config, ConfigReader
 from demandops.model.config.cross_check import cross_check
+from demandops.model.config.entry_patterns import Globs, OnDemand, UnlistedNodes, only_entry
 from demandops.model.config.inventory import Node, id_in_domain
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.model.config.policy import AccessDomain, AccessDomainsFile
@@ -72,12 +72,15 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         if node.capacity is not None:
             named = _with_short_names(node.capacity, settings, reader, file, f"{place}.capacity")
             nodes[id] = node.model_copy(update={"capacity": named})
+
+    def completed(node: Node, domain: AccessDomain | None) -> Node:
+        node = _in_ros_domain(node, domain)
+        capacity = settings.with_short_names(node.capacity) if node.capacity else node.capacity
+        return node.model_copy(update={"capacity": capacity})
+
+    unlisted = UnlistedNodes(reader.patterns[configs.NODES_FILE], domains, completed)
     appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
-    services = {
-        name: _services_of(appdef, definitions, nodes.values(), settings, reader)
-        for name, appdef in appdefs.items()
-    }
     clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of[configs.CLIENTS_FILE]:
         part = reader.read_file(file, registry.ClientsFile)
@@ -89,12 +92,27 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
             clients = clients.model_copy(update={word: getattr(part, word)})
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
+    for pattern in reader.patterns[configs.NODES_FILE]:
+        node = pattern.example()
+        for domain in unlisted.possible_domains(pattern.id):
+            _in_further_domains(reader, {node.id: node}, domains, {node.id: domain})
+    all_nodes = {id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()}
+    if reader.patterns[configs.NODES_FILE]:
+        all_nodes = OnDemand(all_nodes, lambda id: (made := unlisted.find(id)) and made.node)
+        domain_of = OnDemand(domain_of, lambda id: (made := unlisted.find(id)) and made.domain)
+        hosts = OnDemand(hosts, unlisted.other_host)
+    services = {
+        name: _services_of(appdef, definitions, all_nodes, settings, reader)
+        for name, appdef in appdefs.items()
+    }
     clusters = reader.read_items(
         configs.CLUSTERS_FILE, inventory.ClustersFile, "clusters", inventory.Cluster, "name"
     )
     brokers = reader.read_items(
         configs.BROKERS_FILE, inventory.BrokersFile, "brokers", inventory.Broker, "node"
     )
+    if reader.patterns[configs.BROKERS_FILE]:
+        brokers = OnDemand(brokers, only_entry(reader.patterns[configs.BROKERS_FILE]))
     charts = reader.read_items(configs.CHARTS_FILE, registry.ChartsFile, "charts", registry.Chart)
     images = reader.read_items(configs.IMAGES_FILE, registry.ImagesFile, "images", registry.Image)
     for name, image in images.items():
@@ -127,7 +145,10 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     config = Config(
         repo_settings=settings,
         clusters=clusters,
-        nodes={id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()},
+        nodes=all_nodes,
+        node_patterns=tuple(reader.patterns[configs.NODES_FILE]),
+        broker_patterns=tuple(reader.patterns[configs.BROKERS_FILE]),
+        unlisted=unlisted,
         brokers=brokers,
         domains=domains,
         charts=charts,
@@ -190,7 +211,7 @@ def _read_definitions(
 def _services_of(
     appdef: ApplicationDefinition,
     definitions: Mapping[str, ServiceDefinition],
-    nodes: Iterable[Node],
+    nodes: Mapping[str, Node],
     settings: RepoSettings,
     reader: ConfigReader,
 ) -> Services:
@@ -208,13 +229,14 @@ def _services_of(
             of_pods = {"requests": named, "pod_requests": settings.requests_of_pods(named)}
             services[name] = service.model_copy(update=of_pods)
         if service.nodes:
-            runs_at = {}
-            for node in nodes:
-                if service_node := service.nodes.get(node.cluster):
-                    further = (id_in_domain(node.id, d.name) for d in node.access_domains)
-                    runs_at.update(dict.fromkeys((node.id, *further), service_node))
+            runs_at = _by_cluster(service.nodes, nodes)
             services[name] = services[name].model_copy(update={"runs_at": runs_at})
     return services
+
+
+def _by_cluster(at: Mapping[str, str], nodes: Mapping[str, Node]) -> Mapping[str, str]:
+    listed = {id: at[node.cluster] for id, node in nodes.items() if node.cluster in at}
+    return OnDemand(listed, lambda id: at.get(nodes[id].cluster) if id in nodes else None)
 
 
 def _with_short_names(
@@ -294,21 +316,10 @@ def _domains_of_nodes(
     reader: ConfigReader, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
 ) -> Mapping[str, AccessDomain]:
     owner: dict[str, AccessDomain] = {}
-    # by the text before the first wildcard: both lists may be long, and hardly any pair matches
-    by_start = defaultdict[str, dict[str, list[str]]](dict)
-    for name, domain in domains.items():
-        for pattern in domain.nodes:
-            by_start[re.split("[*?]", pattern)[0]].setdefault(name, []).append(pattern)
+    globs = Globs((glob, name) for name, domain in domains.items() for glob in domain.nodes)
     for node in nodes:
-        matches_of_node = (
-            (name, pattern)
-            for end in range(len(node) + 1)
-            for name, patterns in by_start.get(node[:end], {}).items()
-            for pattern in patterns
-            if matches(node, (pattern,))
-        )
         matching: dict[str, str] = {}
-        for name, pattern in matches_of_node:
+        for pattern, name in globs.matching(node):
             matching.setdefault(name, pattern)
             if len(matching) > _MOST_DOMAINS:
                 break

@@ -189,6 +189,15 @@ class OverrideFile(FileModel):
         return parse_time(self.expires) if self.expires else None
 
 
+def override_selects(text: str, kind: str, name: str) -> bool:
+    """Return whether a file's text selects a thing by its name; one that is not valid does not."""
+    try:
+        selectors = base_model.parse_file(OverrideFile, text, "").select
+    except InvalidInput:
+        return False
+    return any(matches(name, getattr(each, f"{kind}s") or ()) for each in selectors)
+
+
 class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so they have no hash
     """An override with its name, which is its file's name."""
 

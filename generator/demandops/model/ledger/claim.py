@@ -109,7 +109,7 @@ class Claim:
 
 def minute_of(moment: datetime) -> str:
     # in UTC, and sorts like the time
-    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
+    return moment.astimezone(timezone.utc).isoformat()[:16]  # strftime does not pad years
 
 
 def requesters_of(claims: Iterable[Claim]) -> tuple[str, ...]:
