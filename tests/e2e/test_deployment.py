@@ -10,7 +10,6 @@ import base64
 import json
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,26 +20,28 @@ import yaml
 from tests.e2e.common.expected import demand
 from tests.e2e.common.pod import Pod
 from tests.e2e.common.rendered import check_chart
-from tests.e2e.common.ros import Client
 from tests.e2e.common.world import demandops
-from tests.e2e.rig import githttp, launch
-from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig import githttp
+from tests.e2e.rig.cluster import Rig, git_server
 from tests.e2e.rig.kube import build_manifest
-from tests.e2e.rig.net import answers, free_port, url
+from tests.e2e.rig.net import free_port, url
 from tests.kit.repo import git
+from tests.kit.ros import Client
 
-CHART = Path(__file__).parents[3] / "deploy" / "chart"
+pytestmark = pytest.mark.only("flux", "the generator's chart does not depend on the controller")
+
+CHART = Path(__file__).parents[2] / "deploy" / "chart"
 RELEASE, NAMESPACE = "generator", "demandops"
-TAKES_OVER_S = 25
+GIT = "git-of-the-chart"
 USER, PASSWORD = "robot", "a token of the git server"
 VALUES: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("deployment.yaml").read_text())
 NEEDED = VALUES["needed"]
 
 
-@pytest.fixture(scope="module")
-def namespace(rig: Rig) -> Iterator[str]:
+@pytest.fixture(scope="module", autouse=True)
+def namespace(rig: Rig) -> Iterator[None]:
     rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
-    yield NAMESPACE
+    yield
     rig.kube.delete("Namespace", NAMESPACE)
 
 
@@ -50,33 +51,36 @@ def namespace(rig: Rig) -> Iterator[str]:
     ids=["as it comes", "one pod", "all set"],
 )
 def test_the_chart_passes_lint_and_what_it_gives_the_server(
-    rig: Rig, namespace: str, tmp_path: Path, values: dict[str, Any]
+    rig: Rig, tmp_path: Path, values: dict[str, Any]
 ) -> None:
-    kinds = check_chart(rig, CHART, RELEASE, namespace, values, tmp_path)
+    kinds = check_chart(rig, CHART, RELEASE, NAMESPACE, values, tmp_path)
     assert ({"Lease", "Role", "RoleBinding"} <= kinds) == (values.get("replicas") != 1)
     assert ("Service" in kinds) == ("secrets" in values)
 
 
 @pytest.mark.parametrize("missing", ["stateRepo", "image"])
 def test_the_chart_is_refused_without_what_it_needs(rig: Rig, tmp_path: Path, missing: str) -> None:
-    given = tmp_path / "values.json"
-    given.write_text(json.dumps({key: NEEDED[key] for key in NEEDED if key != missing}))
+    values = {key: NEEDED[key] for key in NEEDED if key != missing}
     with pytest.raises(Exception, match=missing):
-        rig.helm("template", RELEASE, str(CHART), f"--values={given}")
+        check_chart(rig, CHART, RELEASE, NAMESPACE, values, tmp_path, lint=False)
+
+
+def leads(pod: Pod) -> bool:
+    return pod.code is None and "taking demands on" in pod.text()
 
 
 class Deployed:
     """The installed chart, with a state repo on a Git server that requires a user and password."""
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int) -> None:
-        self.rig, self.folder, self._port = rig, folder, free_port()
-        self._git: subprocess.Popen[bytes] | None = None
+        self.rig, self.folder, port = rig, folder, free_port()
         self.repository = folder / "git" / "state.git"
         self.repository.parent.mkdir()
-        self.state_repo = f"{url(self._port)}/state.git"
-        demandops(folder, "init", str(self.repository), "--bare", "--url", self.state_repo)
+        address = f"{url(port)}/state.git"
+        demandops(folder, "init", str(self.repository), "--bare", "--url", address)
         git(self.repository, "config", "http.receivepack", "true")
-        self.start_git()
+        secrets = {githttp.USER_VARIABLE: USER, githttp.PASSWORD_VARIABLE: PASSWORD}
+        rig.parts.start_together([git_server(GIT, self.repository.parent, port, secrets)])
         key = folder / "key"
         subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
         self.private_key = key.read_text()
@@ -84,7 +88,7 @@ class Deployed:
         self._secret("signing", **{"ssh-privatekey": self.private_key})
         self.values: dict[str, Any] = {
             **NEEDED,
-            "stateRepo": self.state_repo,
+            "stateRepo": address,
             "secrets": {"git": "git", "signing": "signing"},
             "ros": {
                 "domainId": ros_domain,
@@ -93,11 +97,9 @@ class Deployed:
         }
         self.install()
         server = yaml.safe_load(rig.kubeconfig.read_text())["clusters"][0]["cluster"]["server"]
-        names = [f"{RELEASE}-{number}" for number in range(2)]
-        for name in names:
-            rig.kube.wait(f"pod {name}", lambda name=name: rig.kube.get("Pod", name, NAMESPACE))
-        address = server.removeprefix("https://")
+        address, names = server.removeprefix("https://"), (f"{RELEASE}-0", f"{RELEASE}-1")
         self.pods = [Pod(rig.kube, name, NAMESPACE, address, folder) for name in names]
+        self.start(*self.pods)
 
     def install(self) -> None:
         given = self.folder / "values.json"
@@ -105,38 +107,23 @@ class Deployed:
         options = ["--install", f"--namespace={NAMESPACE}", f"--values={given}"]
         self.rig.helm("upgrade", RELEASE, str(CHART), *options)
 
-    def start_git(self) -> None:
-        command = [sys.executable, "-I", "-S", githttp.__file__]
-        command += ["--root", str(self.repository.parent), "--port", str(self._port)]
-        secrets = {githttp.USER_VARIABLE: USER, githttp.PASSWORD_VARIABLE: PASSWORD}
-        self._git = subprocess.Popen(launch.command(*command), env={**os.environ, **secrets})
-        serves = answers(self._port, githttp.HEALTH)
-        self.rig.kube.wait("the Git server", lambda: serves() is None)
-
-    def stop_git(self) -> None:
-        assert self._git is not None
-        self._git.kill()
-        self._git.wait(10)
-
     def start(self, *pods: Pod) -> None:
         """Start the containers of the pods; wait until each pod is the leader or a standby."""
         for pod in pods:
             pod.start()
         for pod in pods:
-            self.wait_text(pod, "taking demands on", "standing by")
+            pod.wait_text("taking demands on", "standing by")
 
-    def wait_text(self, pod: Pod, *texts: str) -> None:
-        def told() -> bool:
-            assert pod.code is None, pod.text()
-            return any(text in pod.text() for text in texts)
+    def by_role(self) -> tuple[Pod, Pod]:
+        """Return the leader, which serves the ROS actions, and the pod that stands by."""
+        active, standby = sorted(self.pods, key=leads, reverse=True)
+        assert leads(active) and not leads(standby)
+        return active, standby
 
-        self.rig.kube.wait(f"{' or '.join(texts)} in {pod.log}", told, TAKES_OVER_S)
-
-    @property
-    def lease(self) -> dict[str, Any]:
-        found = self.rig.kube.get("Lease", RELEASE, NAMESPACE)
-        assert found is not None
-        return dict(found.get("spec") or {})
+    def lease_holder(self) -> str:
+        lease = self.rig.kube.get("Lease", RELEASE, NAMESPACE)
+        assert lease is not None
+        return str((lease.get("spec") or {})["holderIdentity"])
 
     def subjects(self) -> str:
         return git(self.repository, "log", "--format=%s", "main")
@@ -145,7 +132,7 @@ class Deployed:
         for pod in self.pods:
             pod.kill()
         self.rig.helm("uninstall", RELEASE, f"--namespace={NAMESPACE}")
-        self.stop_git()
+        self.rig.parts.stop(GIT)
 
     def _secret(self, name: str, **data: str) -> None:
         encoded = {key: base64.b64encode(value.encode()).decode() for key, value in data.items()}
@@ -154,10 +141,9 @@ class Deployed:
 
 @pytest.fixture(scope="module")
 def deployed(
-    rig: Rig, namespace: str, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
+    rig: Rig, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Deployed]:
-    if rig.existing:
-        pytest.skip("real kubelets start the pods of an existing cluster")
+    assert rig.parts  # else real kubelets start the pods
     if os.geteuid():
         pytest.skip("only root can start a container")
     folder = tmp_path_factory.mktemp("deployed")
@@ -165,35 +151,21 @@ def deployed(
         if parent.owner() == "root" and parent != Path("/tmp"):
             parent.chmod(parent.stat().st_mode | 0o011)
     made = Deployed(rig, folder, ros_domain)
-    made.start(*made.pods)
     yield made
     made.close()
 
 
-@pytest.fixture
-def active(deployed: Deployed) -> Pod:
-    (pod,) = [pod for pod in deployed.pods if _leads(pod)]
-    return pod
-
-
-@pytest.fixture
-def standby(deployed: Deployed, active: Pod) -> Pod:
-    (pod,) = [pod for pod in deployed.pods if pod is not active]
-    return pod
-
-
 def test_one_pod_answers_with_signed_commits(deployed: Deployed, client: Client) -> None:
+    client.ready()
     sent = client.call(demand(1))
     assert sent.status == "succeeded", sent.message
     assert "gpgsig" in git(deployed.repository, "cat-file", "commit", sent.commit)
-    assert sum(_leads(pod) for pod in deployed.pods) == 1
-    assert len(deployed.lease["holderIdentity"]) > 36
+    deployed.by_role()
+    assert len(deployed.lease_holder()) > 36
 
 
-def test_a_pod_has_neither_privileges_nor_secrets_in_sight(
-    deployed: Deployed, active: Pod, standby: Pod
-) -> None:
-    for pod in (active, standby):
+def test_a_pod_has_neither_privileges_nor_secrets_in_sight(deployed: Deployed) -> None:
+    for pod in deployed.pods:
         process = Path("/proc", str(pod.pid))
         status = dict(line.split(":\t", 1) for line in (process / "status").open() if ":\t" in line)
         assert status["Uid"].split() == 4 * ["10001"]
@@ -220,46 +192,45 @@ def test_the_account_may_renew_the_lease_and_nothing_else(deployed: Deployed) ->
 
 
 def test_a_killed_pod_is_replaced_and_stands_by_when_it_returns(
-    deployed: Deployed, active: Pod, standby: Pod, client: Client
+    deployed: Deployed, client: Client
 ) -> None:
+    active, standby = deployed.by_role()
     active.kill()
-    deployed.wait_text(standby, "taking demands on")
+    standby.wait_text("taking demands on")
+    client.ready()
     sent = client.call(demand(2))
     assert sent.status == "succeeded", sent.message
     deployed.start(active)
-    assert _leads(standby)
-    assert not _leads(active)
+    assert deployed.by_role() == (standby, active)
 
 
 def test_a_pod_that_returns_hands_in_its_journal_before_it_stands_by(
-    deployed: Deployed, active: Pod, standby: Pod, client: Client
+    deployed: Deployed, client: Client
 ) -> None:
+    active, standby = deployed.by_role()
     before = deployed.subjects()
-    deployed.stop_git()
+    deployed.rig.parts.kill(GIT)
     sent = client.send(demand(3))
     client.wait(lambda: "waiting:" in sent.stages)
     active.kill()
-    deployed.wait_text(standby, "taking demands on")
-    deployed.start_git()
+    standby.wait_text("taking demands on")
+    deployed.rig.parts.start(GIT)
     assert deployed.subjects() == before, "the other pod must not have booked the demand"
     slow = deployed.repository / "hooks" / "pre-receive"
-    slow.write_text("#!/bin/sh\nsleep 5\n")
+    slow.parent.mkdir(exist_ok=True)
+    slow.write_text("#!/bin/sh\nsleep 5\n")  # else the push would win against a wrong order, too
     slow.chmod(0o755)
     deployed.start(active)
     slow.unlink()
     assert deployed.subjects() != before
     assert "resuming demand" in active.text()
-    assert not _leads(active)
+    assert deployed.by_role() == (standby, active)
 
 
-def test_an_upgrade_leaves_the_lease_to_its_holder(deployed: Deployed, active: Pod) -> None:
-    holder = deployed.lease["holderIdentity"]
+def test_an_upgrade_leaves_the_lease_to_its_holder(deployed: Deployed) -> None:
+    active, _ = deployed.by_role()
+    holder = deployed.lease_holder()
     deployed.values |= {"fetchInterval": "10s"}
     deployed.install()
-    assert deployed.lease["holderIdentity"] == holder
+    assert deployed.lease_holder() == holder
     assert active.code is None
-
-
-def _leads(pod: Pod) -> bool:
-    """Return whether a pod is the leader, which serves the ROS actions."""
-    return pod.code is None and "taking demands on" in pod.text()
