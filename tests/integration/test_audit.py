@@ -13,10 +13,10 @@ from demandops.cli.main import run as run_command
 from demandops.model.config.override import format_time
 from demandops.model.ledger.claim import read
 
+from tests.golden.cases import GOLDEN, requests_of
 from tests.integration.conftest import On
 from tests.kit.cli import Ran, Run
 from tests.kit.goals import APP, EXPERIMENT, connection, goal, put
-from tests.kit.golden import GOLDEN, requests_of
 from tests.kit.repo import FORGER, GitRepo, git
 
 ROOT = Path(__file__).parents[2]

@@ -17,7 +17,7 @@ import pytest
 import yaml
 import zenoh
 
-from tests.kit.golden import rendered
+from tests.golden.cases import rendered
 from tests.kit.limits import PATIENCE_S
 
 STEP = "2-station00-joins"

@@ -23,7 +23,7 @@ from demandops.base import settings
 from demandops.cli import main
 from demandops.cli.authoring.schema import SCHEMAS
 
-from tests.kit.golden import CASES, whole
+from tests.golden.cases import CASES, whole
 
 ROOT = Path(__file__).parents[2]
 INTERFACES = ROOT / "ros_bridge" / "interfaces"

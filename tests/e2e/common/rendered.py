@@ -11,7 +11,7 @@ import yaml
 
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Manifest
-from tests.kit.golden import CASES, whole
+from tests.golden.cases import CASES, whole
 
 ARGOCD = "argocd-"  # the prefix of the cases for Argo CD
 

@@ -13,7 +13,7 @@ from demandops.cluster.health import (
     health_reader,
 )
 
-from tests.kit.cluster import Case, Letters, condition, deployments, read_cases, told
+from tests.unit.cluster.cases import Case, Letters, condition, deployments, read_cases, told
 
 URL = "https://git.example/fleet.git"
 COMMITS = Letters()

@@ -16,7 +16,7 @@ from demandops.cluster.health import (
     worst,
 )
 
-from tests.kit.cluster import Case, Letters, condition, deployments, read_cases, told
+from tests.unit.cluster.cases import Case, Letters, condition, deployments, read_cases, told
 
 COMMITS = Letters()
 PLACE = ClusterDomain("c-its", "perception", "ns")

@@ -19,14 +19,15 @@ from demandops.cluster.rollouts import RolloutWatcher
 from demandops.cluster.watches import ConfigMapWatch, ObjectCache
 from demandops.decide.decision import decide
 
+from tests.golden.cases import requests_of, start
 from tests.kit import goals
 from tests.kit.clock import Clock
-from tests.kit.cluster import Letters, kube_api
-from tests.kit.golden import requests_of, start
+from tests.kit.cluster import kube_api
 from tests.kit.http import Answer, Call, kubeconfig, serving
 from tests.kit.limits import PATIENCE_S
 from tests.kit.memory import NOW, MemoryRepo
 from tests.kit.rig import wait_until
+from tests.unit.cluster.cases import Letters
 
 OVER = ObjectSelector("Application", "argocd", "demandops-perception")
 CHILDREN = ObjectSelector("Application", "perception")

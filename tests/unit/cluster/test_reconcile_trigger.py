@@ -17,10 +17,10 @@ from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import REQUESTED_AT
 from demandops.cluster.reconcile_trigger import ReconcileTrigger, _Wake, signature, web_address
 
+from tests.golden.cases import start
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.cluster import KubeApi, kube_api
-from tests.kit.golden import start
 from tests.kit.http import Answer, Call, Server, kubeconfig, serving
 from tests.kit.limits import PATIENCE_S
 from tests.kit.rig import wait_until
