@@ -323,7 +323,7 @@ class Client(ABC):
         return strict_yaml.dump(configuration)
 
     def settings(self, config: Config) -> ClientSettings:
-        settings = config.clients.of(self.type.word)
+        settings: ClientSettings = getattr(config.clients, self.type.word, ClientSettings())
         for file, patch in self.shaping.patches:
             settings = patched_settings(settings, patch, file)
         return settings
