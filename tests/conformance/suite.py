@@ -86,6 +86,7 @@ class Servers:
         if self.are_asked:
             self._books = self.client.node.create_client(GetBookkeeping, bookkeeping)
             self.client.wait(self._books.service_is_ready)
+            self.client.ask(lambda: self._books.call_async(GetBookkeeping.Request()))
 
     def close(self) -> None:
         self.client.close()
