@@ -7,6 +7,7 @@ requesters, too.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 STEPS = (
@@ -49,6 +50,24 @@ def expected(step: int) -> dict[str, list[str]]:
         **{f"connection {node} to edge": {S, node} for node in connected},
     }
     return {subject: sorted(who) for subject, who in sorted(rows.items()) if who}
+
+
+def requesters(
+    inside: Collection[str], edge: str = "edge", station: str = S
+) -> dict[str, list[str]]:
+    """Extend the table to any set of vehicles that are near, and to another intersection."""
+    if not inside:
+        return {}
+    everybody = sorted({station, *inside})
+    rows = {
+        f"connection {station} to {edge}": everybody,
+        f"object-detection {station}": everybody,
+        f"object-fusion {edge}/object_detection_fusion": everybody,
+    }
+    rows |= {f"connection {vehicle} to {edge}": sorted({station, vehicle}) for vehicle in inside}
+    if V0 in inside:
+        rows[f"object-detection {V0}"] = sorted({station, V0})
+    return dict(sorted(rows.items()))
 
 
 def observed(books: dict[str, Any]) -> dict[str, list[str]]:

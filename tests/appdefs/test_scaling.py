@@ -9,7 +9,7 @@ from typing import Any, Literal
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops.decide.override_report import override_report, warnings
-from demandops.decide.planning.release_keys import affected_keys
+from demandops.decide.planning.planner import affected_keys
 from demandops.decide.state import rendered_files, try_configuration
 from demandops.model.release import ServiceKey
 
@@ -102,17 +102,6 @@ def test_the_page_shows_the_template_that_serves_both() -> None:
     text = re.sub("^    ", "", shown, flags=re.MULTILINE)
     for path in (ROOT / "appdefs" / "object-detection-fusion" / "values").iterdir():
         assert text in path.read_text(), path.name
-
-
-SHIPPED = "appdefs/object-detection-fusion/appdef.yaml"
-BY_WHO = "{min: 0, max: 9, per: {requesters: 1}, mayDependOnRequesters: true, dividesWork: true}"
-BY_CLAIMS = "{min: 0, max: 9, per: {claims: 1}, dividesWork: true}"
-FOLLOWING = {
-    SHIPPED: skeleton()[SHIPPED]
-    .replace("prefix: od\n", f"prefix: od\n    scaling: {BY_WHO}\n")
-    .replace("prefix: of\n", f"prefix: of\n    scaling: {BY_CLAIMS}\n")
-}
-"""An appdef with one detection for each requester and one fusion for each claim."""
 
 
 @pytest.mark.parametrize(

@@ -41,11 +41,12 @@ from demandops_ros import messages
 from hypothesis import strategies as st
 
 from tests.fuzz import Target
-from tests.kit import forms, golden, plain_yaml
-from tests.kit.cluster import Letters
+from tests.golden import cases as golden
+from tests.kit import forms, plain_yaml
 from tests.kit.config import state_of
 from tests.kit.goals import EXPERIMENT
 from tests.kit.memory import NOW
+from tests.unit.cluster.cases import Letters
 from tests.unit.demand.test_fuzz import ANYTHING, KEY, TEXT, assert_told, outcome
 
 _SEEDS = plain_yaml.load(Path(__file__).with_name("seeds.yaml").read_text())

@@ -1,4 +1,7 @@
-"""A value that the program writes as text is still the same when another program reads it."""
+"""A value that the program writes as text is still the same when another program reads it.
+
+Claims, names, texts in YAML and commit messages have tests with random values in ``tests/unit``.
+"""
 
 from __future__ import annotations
 
@@ -17,17 +20,14 @@ from typing import Any
 import pygit2
 import pyjson5
 import yaml
-from demandops.base import naming, strict_yaml
+from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
-from demandops.base.naming import Subject, SubjectKind, topic_problem
 from demandops.cli.changes.configure import override_text, selector
 from demandops.decide.state import try_configuration
 from demandops.model.config.base_model import parse_file
 from demandops.model.config.load import load
 from demandops.model.config.override import Override, OverrideFile
 from demandops.model.demand.goals import _value_problem
-from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.write.proposal_branch import branch_name
 from demandops.serve import proposal
@@ -36,21 +36,11 @@ from hypothesis import strategies as st
 from tests.fuzz import Target
 from tests.kit import forms
 from tests.kit.config import state_of
-from tests.kit.memory import NOW, MemoryRepo
+from tests.kit.memory import MemoryRepo
 from tests.kit.plain_yaml import FAST
-from tests.unit.ledger.test_claim_file import TRICKY, claims, values
-from tests.unit.ledger.test_claim_file import (
-    test_every_claim_survives_its_file as claim_is_read_back,
-)
+from tests.unit.ledger.test_claim_file import TRICKY, values
 from tests.unit.render.test_inert import TRAPS, UNSEEN
-from tests.unit.render.test_inert import (
-    test_a_written_text_is_read_back_by_every_parser as text_is_read_back,
-)
-from tests.unit.repo.conftest import Desk
 from tests.unit.repo.test_trailers import IDS
-from tests.unit.repo.test_trailers import (
-    test_every_id_is_read_back_by_git_and_by_us_as_it_was as message_is_read_back,
-)
 
 _ODD_NAMES = ["../x", "/x", ".git", "a.lock", "-x", "--x=y", "@{", "a~b", "a" * 300]
 _SOME = [*TRAPS, *UNSEEN, *TRICKY, *_ODD_NAMES]
@@ -60,27 +50,11 @@ _LABEL_KEY = re.compile(
     r"([a-z0-9][a-z0-9.-]{0,252}/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?"
 )
 _SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
-_NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
 _LAUNCH = re.compile(r"node_name:=[a-z0-9_]+|__node:=[a-z0-9_]+")
 
 
 def _yaml(text: str) -> Any:
     return yaml.load(text, Loader=FAST)  # noqa: S506 - derives from SafeLoader
-
-
-def text_in_yaml(text: str) -> None:
-    text_is_read_back(text)
-
-
-def value_in_yaml(value: Any) -> None:
-    written = strict_yaml.dump({"a": value})
-    assert strict_yaml.load(written) == _yaml(written) == {"a": value}
-    assert _yaml(f"a: {strict_yaml.to_json(value)}") == {"a": value}
-    assert pyjson5.decode(strict_yaml.to_json(value)) == value
-
-
-def claim_in_its_file(claim: Any) -> None:
-    claim_is_read_back.hypothesis.inner_test(claim)
 
 
 # ---- rendered files ----
@@ -163,19 +137,6 @@ def _below_its_folder(path: str) -> None:
     assert all(len(part) <= 255 for part in parts), path
 
 
-def ledger_path(ids: tuple[str, str]) -> None:
-    for kind in SubjectKind:
-        path = claim_files.path_of(ClaimKey(Subject(kind, ids[0]), ids[1]))
-        _below_its_folder(path)
-        assert claim_files.kind_of(path) is kind, path
-
-
-def name_of_object(ids: tuple[str, str]) -> None:
-    for name in (naming.object_name("od", *ids), naming.object_name("", ids[0])):
-        assert _NAME.fullmatch(name) and len(name) <= naming.MAX_NAME, name
-        assert not topic_problem(f"/{naming.topic_part(*ids)}"), ids
-
-
 def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
     """Check that the command refuses what a person gives, or writes all of it to the override."""
     reason, owner, nodes, patch = words
@@ -199,12 +160,6 @@ def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
 def _repo() -> pygit2.Repository:
     folder = tempfile.mkdtemp(prefix="demandops-fuzz-")
     return pygit2.init_repository(folder, bare=True, initial_head="main")
-
-
-def message_in_git(words: tuple[list[str], str, str]) -> None:
-    names, request, application = words
-    inner = message_is_read_back.hypothesis.inner_test
-    inner(Desk(now=NOW), _repo(), names=names, request=request, application=application)
 
 
 def author_in_git(words: tuple[str, str, datetime]) -> None:
@@ -239,17 +194,10 @@ _PATCH = st.dictionaries(TEXT, values, max_size=3).filter(lambda one: not _value
 
 _NODES = st.lists(TEXT, min_size=1, max_size=2)
 _TEXTS = st.lists(TEXT, min_size=1, max_size=3)
-_IDS = st.lists(IDS, min_size=1, max_size=3, unique=True)
 
 TARGETS = (
-    Target(text_in_yaml, values=TEXT),
-    Target(value_in_yaml, values=values.filter(lambda value: not _value_problem(value, 0))),
-    Target(claim_in_its_file, values=claims),
     Target(rendered_file, values=st.tuples(st.integers(), _TEXTS).map(_filled)),
     Target(override_by_command, values=st.tuples(TEXT, TEXT, _NODES, _PATCH)),
-    Target(ledger_path, values=_PAIR),
-    Target(name_of_object, values=_PAIR),
-    Target(message_in_git, values=st.tuples(_IDS, IDS, IDS)),
     Target(author_in_git, values=st.tuples(TEXT, TEXT, st.datetimes())),
     Target(branch, values=_PAIR),
     Target(pull_request, values=st.tuples(TEXT, st.lists(IDS, max_size=2))),

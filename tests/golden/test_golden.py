@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from demandops.decide.state import rendered_files
 
-from tests.kit.golden import CASES, play, read, rendered, to_store, whole
+from tests.golden.cases import CASES, play, read, rendered, to_store, whole
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 
-from tests.kit.golden import CASES, GOLDEN, to_store
+from tests.golden.cases import CASES, GOLDEN, to_store
 
 
 def main() -> None:

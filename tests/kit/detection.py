@@ -34,9 +34,9 @@ def rule(name: str, **fields: Any) -> dict[str, Any]:
     return {"name": name} | ({} if "deploymentRequest" in fields else own) | fields
 
 
-def text_of(*rules: dict[str, Any], sources: dict[str, Any] = SOURCES) -> str:
+def text_of(*rules: dict[str, Any], sources: dict[str, Any] = SOURCES, **file: Any) -> str:
     head = {"apiVersion": "demandops/v1", "kind": "DetectorRules"}
-    return strict_yaml.dump({**head, "sources": sources, "rules": [*rules]})
+    return strict_yaml.dump({**head, **file, "sources": sources, "rules": [*rules]})
 
 
 def file_of(*rules: dict[str, Any], sources: dict[str, Any] = SOURCES) -> RuleFile:

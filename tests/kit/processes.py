@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -46,11 +45,6 @@ class Told:
     answers: dict[str, dict[str, Any]] = field(default_factory=dict)
     withdrawn: list[str] = field(default_factory=list)
     finished: bool | None = None
-    waits: dict[str, float] = field(default_factory=dict)
-    """The seconds from each demand to its answer."""
-    first: float = 0.0
-    last: float = 0.0
-    """When the first demand was sent, and the last event came."""
 
 
 class Run:
@@ -64,21 +58,16 @@ class Run:
 
     def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
         """Return all events at the end; ``on_ready`` is called when the process takes demands."""
-        sent: dict[str, float] = {}
         with self._pipe.open() as lines:
             for line in lines:
                 event = json.loads(line)
-                self._told.last = time.monotonic()
                 if "ready" in event:
                     self.pid = event["ready"]
                     on_ready()
                 elif "sent" in event:
                     self._told.sent.append(event["sent"])
-                    sent[event["sent"]] = self._told.last
-                    self._told.first = self._told.first or self._told.last
                 elif "answer" in event:
                     self._told.answers[event["answer"]] = event
-                    self._told.waits[event["answer"]] = self._told.last - sent[event["answer"]]
                 elif "withdrawn" in event:
                     self._told.withdrawn.append(event["withdrawn"])
                 elif "failed" in event:

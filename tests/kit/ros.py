@@ -186,6 +186,7 @@ class Client:
     """An action client with its own executor, which spins only while the test waits."""
 
     def __init__(self, domain: int, action: str = DEFAULT_ACTION_NAME) -> None:
+        self.action = action
         self._context = rclpy.Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = rclpy.create_node("test_client", context=self._context)
@@ -212,6 +213,10 @@ class Client:
 
     def ready(self) -> None:
         self.wait(self.reaches_a_node)
+        self.ask(lambda: ask_the_node(self._client))
+
+    def ask(self, call: Callable[[], Any]) -> None:
+        """Call a service once a second until it answers; it may not know this client at first."""
         asked: list[Any] = []
         ask_at = 0.0
 
@@ -219,7 +224,7 @@ class Client:
             nonlocal ask_at
             if time.monotonic() > ask_at:
                 ask_at = time.monotonic() + 1
-                asked.append(ask_the_node(self._client))
+                asked.append(call())
             return any(one.done() for one in asked)
 
         self.wait(is_answered)

@@ -14,19 +14,20 @@ from typing import Any
 
 from demandops.base.errors import InvalidInput
 from demandops.connections import connection
-from demandops.connections.connection import ConnectionType, Route
-from demandops.decide import booking, changeset, decision, edits
+from demandops.connections.connection import Connection, ConnectionType, Route
+from demandops.decide import booking, decision, edits
 from demandops.decide.admission import completing, permission
 from demandops.decide.checks import forbidden
+from demandops.decide.checks.forbidden import Usage
 from demandops.decide.decision import Decision
-from demandops.decide.placement import capacity, placement
+from demandops.decide.placement import placement
 from demandops.decide.placement.candidates import Choice
-from demandops.decide.placement.capacity import Usage
-from demandops.decide.planning import overrides, planner, release_keys
+from demandops.decide.planning import overrides, planner
+from demandops.decide.state import Changeset
 from demandops.model.config.config import Config
-from demandops.model.demand.demand import Lease
-from demandops.model.ledger import ledger
+from demandops.model.demand.demand import Application, Lease
 from demandops.model.ledger.claim import Claim, path_of, text_of
+from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import WaitingDemand
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.load import snapshot
@@ -100,9 +101,17 @@ def in_reverse(right: Wrong, *given: Any) -> Any:
 
 plant("let_strangers_change_a_demand", 1, permission, "stranger_faults", lambda *_: ())
 plant("release_only_the_first_claim", 28, booking, "claims_of", first_only)
-plant("replace_what_was_joined", 2, Claim, "extending", itself)
-plant("commit_what_is_booked_already", 6, Claim, "after_booking", itself)
+plant("replace_what_was_joined", 2, Application, "extended", lambda _, app, more: more)
+plant("replace_what_was_joined", 2, Connection, "extended", lambda _, connection, more: more)
 plant("grant_one_claim_too_many", 4, forbidden, "_held", lambda held, *given: held(*given) - 1)
+
+
+@wrong(6, booking, "book")
+def commit_what_is_booked_already(
+    book: Any, ledger: Any, item: Any, request: Any, key: Any, current: Any, now: Any, **more: Any
+) -> Any:
+    made = book(ledger, item, request, key, current, now, **more)
+    return made.replace(key, replace(made.get(key), booked=now))
 
 
 @wrong(6, booking, "shut_down")
@@ -230,7 +239,7 @@ plant("let_others_overtake_in_a_batch", 44, Agenda, "book_those_let_in", nothing
 plant("leave_drained_nodes_full", 19, agenda, "_to_drain", lambda *_: [])
 plant("place_on_drained_nodes", 13, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 3, placement, "_booked", nothing)
-plant("count_no_room", 7, capacity, "excesses", lambda *_: [])
+plant("count_no_room", 7, forbidden, "excesses", lambda *_: [])
 
 
 @wrong(0, Usage, "plus")
@@ -241,7 +250,7 @@ def count_released_room_as_taken(plus: Any, usage: Any, more: Any) -> Any:
 # ---- overrides ----
 
 
-@wrong(8, changeset, "plan_change")
+@wrong(8, decision, "plan_change")
 def apply_no_override_to_what_a_demand_changes(
     plan: Any, before: Any, after: Any, *more: Any
 ) -> Any:
@@ -251,10 +260,13 @@ def apply_no_override_to_what_a_demand_changes(
 
 @wrong(0, snapshot, "render_all")
 def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any = None) -> Any:
-    return changeset.Changeset({**(more or {})}, ())
+    return Changeset({**(more or {})}, ())
 
 
-plant("let_the_lowest_priority_win", 26, ledger, "by_rank", in_reverse)
+@wrong(26, World, "__post_init__")
+def let_the_lowest_priority_win(right: Any, world: Any) -> None:
+    right(world)
+    object.__setattr__(world, "overrides", world.overrides[::-1])
 
 
 @wrong(16, overrides, "fits")
@@ -263,7 +275,6 @@ def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bo
 
 
 plant("run_what_is_denied", 5, planner, "without_suspended", itself)
-plant("run_what_is_denied", 5, release_keys, "without_suspended", itself)
 plant("book_what_is_denied", 0, forbidden, "denial_faults", lambda *_: ())
 
 
@@ -355,6 +366,26 @@ def book_again_what_was_approved(
 
 
 plant("turn_down_what_waits", 1, ProposalBranches, "put", lambda *_: "")
+
+
+# ---- answers, withdrawals and stops ----
+
+
+@wrong(0, journal.Journal, "mark_done")
+def note_outcomes_only_in_memory(
+    mark_done: Any, made: Any, operations: Any, *, durably: bool = False
+) -> None:
+    mark_done(made, operations)
+
+
+@wrong(0, Demands, "fail")
+def forget_what_a_stop_leaves(
+    fail: Any, made: Any, batch: Any, error: Any, keep: bool = False
+) -> None:
+    fail(made, batch, error)
+
+
+plant("say_that_all_is_withdrawn", 0, Demands, "withdraw", lambda *_: True)
 
 
 # ---- restart ----

@@ -74,6 +74,7 @@ class History:
         things = (
             [self.demand] * 15 + [self.rush] * 2 + [self.wait] * 4 + [self.edit] * 3
             + [self.decide] * 2 + [self.crash] * 2 + [self.spoil_network] * 3 + [self.set_clocks]
+            + [self.withdraw] * 2 + [self.stop]
         )  # fmt: skip
         self.turns.sleep(1)
         for _ in range(steps):
@@ -201,6 +202,16 @@ class History:
 
     def wait(self) -> None:
         self.turns.sleep(self.chance.choice([0.1, 1, 10, 31, 61, 100, 200, 1000]))
+
+    def withdraw(self) -> None:
+        under_way = [one for one in self.oracle.asked.values() if one.is_under_way]
+        if under_way:
+            self.oracle.withdraw(self.chance.choice(under_way))
+
+    def stop(self) -> None:
+        machine = self.chance.choice(self.world.machines)
+        if machine.generator:
+            machine.stop(self.chance.choice([0, 0.2, 60]))
 
     def crash(self) -> None:
         machine = self.chance.choice(self.world.machines)

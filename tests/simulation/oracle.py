@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pygit2
-from demandops.base.errors import InvalidInput, TurnedDown
+from demandops.base.errors import InvalidInput, ShuttingDown, TurnedDown, Withdrawn
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import Claim
 from demandops.repo import verification
@@ -51,6 +51,13 @@ class Asked:
     number: int
     is_answered: bool = False
     is_lost: bool = False
+    is_withdrawn: bool = False
+    must_resume: bool = False
+    """Whether a stop left it to the next start."""
+
+    @property
+    def is_under_way(self) -> bool:
+        return not (self.is_answered or self.is_lost or self.machine.generator is None)
 
     @property
     def needs_approval(self) -> bool:
@@ -103,6 +110,10 @@ class Oracle:
         self._watch(asked)
         return asked
 
+    def withdraw(self, asked: Asked) -> None:
+        assert asked.machine.generator is not None
+        asked.is_withdrawn |= asked.machine.generator.withdraw(asked.ticket.operation)
+
     def check(self) -> None:
         self._guard(self._follow_main)
         if self.world.failure is not None:
@@ -152,6 +163,7 @@ class Oracle:
                 self._own_work(claims, *by)
                 continue
             if not asked.needs_approval:
+                assert not asked.is_withdrawn, f"{operation} is booked, but was withdrawn"
                 self._assert_in_order(asked)
             time = self.world.turns.monotonic() if branch else asked.time
             held = self.books.content(asked.goal.get("demand", ""))
@@ -274,10 +286,15 @@ class Oracle:
 
     def _check_answer(self, asked: Asked) -> None:
         self._follow_main()
-        asked.is_answered = True
         operation, error = asked.ticket.operation, asked.ticket.future.exception()
+        if isinstance(error, ShuttingDown) and asked.ticket.journaled.result():
+            asked.must_resume = True
+            return
+        asked.is_answered = True
         place = self._place.get(operation)
         if error is not None:
+            is_withdrawn = isinstance(error, Withdrawn)
+            assert asked.is_withdrawn or asked.needs_approval or not is_withdrawn, "nobody did"
             assert "internal error" not in str(error), error
             assert place is None, f"{operation} is booked, but was answered {error}"
             is_decided = any(branch in str(error) for branch in self.decided)
@@ -330,13 +347,14 @@ class Oracle:
             if asked.machine is not machine or asked.is_answered or asked.is_lost:
                 continue
             if operation in tickets:
-                asked.ticket = tickets[operation]
+                asked.ticket, asked.must_resume = tickets[operation], False
                 self._watch(asked)
                 continue
+            assert not asked.must_resume, f"{operation} is forgotten at a stop: {asked.goal}"
             asked.is_lost = True
             if asked.ticket.state not in ("arrived", "done"):
                 # at a crash, the journal may already have an outcome that the requester did not get
-                may_fail = machine.has_rejected or asked.needs_approval
+                may_fail = machine.has_rejected or asked.needs_approval or asked.is_withdrawn
                 may_fail |= not self._possible(asked).isdisjoint({"refused", "unchanged", "waits"})
                 assert may_fail or operation in self._place, (
                     f"{operation} is forgotten: {asked.goal}"

@@ -88,6 +88,15 @@ class Machine(Runtime):
             if not self.crashes_in:
                 self.crash()
 
+    def stop(self, timeout: float) -> None:
+        """Stop the generator; its threads have the time for what is queued, and the disk syncs."""
+        assert self.generator is not None
+        stopped = self.generator.stop(timeout)
+        self.turns.wait(lambda: stopped.done() or not self.is_up)
+        if self.is_up:
+            self.world.dead += self.threads
+            self.is_up, self.generator, self.crashes_in, self.threads = False, None, 0, []
+
     def crash(self) -> None:
         """Stop all threads and lose what is not on the disk, which they cannot reach."""
         self.world.dead += self.threads

@@ -1,5 +1,7 @@
 """The public surface is `public_surface.yaml`; a change of that file is a change for users.
 
+The fields of files and goals are in ``messages/messages.txt``.
+
 Everything else is internal. `docs/public-api.md` is the same list for people.
 """
 
@@ -7,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -21,7 +23,7 @@ from demandops.base import settings
 from demandops.cli import main
 from demandops.cli.authoring.schema import SCHEMAS
 
-from tests.kit.golden import CASES, whole
+from tests.golden.cases import CASES, whole
 
 ROOT = Path(__file__).parents[2]
 INTERFACES = ROOT / "ros_bridge" / "interfaces"
@@ -81,34 +83,6 @@ def interfaces() -> Json:
     return found
 
 
-def fields_of_schema(schema: Json) -> Json:
-    """Return the names of the fields of each mapping in a schema, by the path of the mapping."""
-    found: dict[str, list[str]] = {}
-    for parent, name in walk(schema, schema.get("$defs", {}), ""):
-        names = found.setdefault(parent or "(top)", [])
-        if name not in names:
-            names.append(name)
-    return {parent: " ".join(names) for parent, names in found.items()}
-
-
-def walk(schema: Json, definitions: Json, path: str) -> Iterator[tuple[str, str]]:
-    if "$ref" in schema:
-        schema = definitions[schema["$ref"].rsplit("/", 1)[-1]]
-    for kind in ("anyOf", "oneOf", "allOf"):
-        for each in schema.get(kind, ()):
-            yield from walk(each, definitions, path)
-    for name, each in schema.get("properties", {}).items():
-        constant = each.get("const")
-        yield path, f"{name}={constant}" if constant else name
-        yield from walk(each, definitions, f"{path}.{name}".lstrip("."))
-    if isinstance(schema.get("items"), dict):
-        yield from walk(schema["items"], definitions, f"{path}[]")
-    patterns = schema.get("patternProperties", {}).values()
-    for each in (schema.get("additionalProperties"), *patterns):
-        if isinstance(each, dict):
-            yield from walk(each, definitions, f"{path}.*")
-
-
 def claim_files() -> Json:
     """Return the fields of the claims in the golden cases, by version and kind."""
     found: dict[str, set[str]] = {}
@@ -137,9 +111,6 @@ SECTIONS: dict[str, Callable[[], object]] = {
         name: members(getattr(demandops_ros, name)) for name in demandops_ros.__all__
     },
     "ROS interfaces": interfaces,
-    "files": lambda: {
-        name: fields_of_schema(model.model_json_schema()) for name, (model, _) in SCHEMAS.items()
-    },
     "claim files": claim_files,
 }
 
@@ -165,7 +136,7 @@ def test_people_find_everything_in_the_documentation() -> None:
     listed = {word for text in re.findall(r"`([^`]+)`", PAGE) for word in text.split()}
     interface_names = {name.split("/")[1] for name in PUBLIC["ROS interfaces"]}
     kinds = {text for kind in PUBLIC["claim files"] for text in kind.split()}
-    names = {*PUBLIC["commands"], *PUBLIC["environment"], *PUBLIC["client"], *PUBLIC["files"]}
+    names = {*PUBLIC["commands"], *PUBLIC["environment"], *PUBLIC["client"], *SCHEMAS}
     names |= {*map(str, PUBLIC["exit codes"].values()), *interface_names, *kinds}
     assert {*names, settings.API_VERSION} - listed == set()
 

@@ -58,7 +58,3 @@ def test_a_refusal_must_be_the_one_that_is_expected() -> None:
         f"{{{fault}}}, {{{fault}, says: [edge]}}",
     ):
         assert "is refused with other faults" in _failing(f"{bad}  refused: [{claimed}]\n")
-
-
-def test_the_scenarios_are_where_they_are_looked_for() -> None:
-    assert len(FILES) >= 20

@@ -59,7 +59,7 @@ def _requesters(outcome: Outcome) -> Iterator[str]:
     inside: set[str] = set()
     for formed in outcome.formed:
         inside ^= {formed.vehicle}
-        if fault := differ(fleet.requesters(inside), formed.bookkeeping):
+        if fault := differ(paper.requesters(inside), formed.bookkeeping):
             yield f"{formed}: {fault}"
 
 

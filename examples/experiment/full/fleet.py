@@ -103,24 +103,6 @@ def initial_deployment(vehicles: Collection[str]) -> dict[str, Any]:
     return {"id": "initial-deployment", "apps": [], "connections": carried, "shutdown": False}
 
 
-def requesters(
-    inside: Collection[str], edge: str = "edge", station: str = S
-) -> dict[str, list[str]]:
-    """Extend the paper's table to any set of vehicles, and to another intersection."""
-    if not inside:
-        return {}
-    everybody = sorted({station, *inside})
-    rows = {
-        f"connection {station} to {edge}": everybody,
-        f"object-detection {station}": everybody,
-        f"object-fusion {edge}/object_detection_fusion": everybody,
-    }
-    rows |= {f"connection {vehicle} to {edge}": sorted({station, vehicle}) for vehicle in inside}
-    if VEHICLES[0] in inside:
-        rows[f"object-detection {VEHICLES[0]}"] = sorted({station, VEHICLES[0]})
-    return dict(sorted(rows.items()))
-
-
 def fusion_inputs(inside: Collection[str]) -> frozenset[str]:
     """Return the topics that the fusion must read while these vehicles are near."""
     if not inside:

@@ -17,7 +17,8 @@ from typing import Any
 
 import yaml
 
-from . import fleet
+from examples.experiment import paper
+
 from .checks import Check, check_nodes, differ
 from .experiment import Experiment, Say
 from .observers import CloudObserver
@@ -102,7 +103,8 @@ def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
     """Return the requesters while each vehicle is near the intersection of this number."""
     rows: dict[str, list[str]] = {}
     for number, (edge, station) in enumerate(zip(EDGES, STATIONS, strict=True)):
-        rows |= fleet.requesters([one for one, at in inside.items() if at == number], edge, station)
+        near = [vehicle for vehicle, at in inside.items() if at == number]
+        rows |= paper.requesters(near, edge, station)
     return dict(sorted(rows.items()))
 
 
@@ -171,8 +173,10 @@ class LargeExperiment(Experiment):
 
     def _start_cluster(self) -> None:
         vehicles = [route.vehicle for route in self._routes]
-        self._rig = self._stack.enter_context(Rig(CLUSTER, nodes=NODES, report=self._say))
-        fleet = self._stack.enter_context(Rig(FLEET, nodes=vehicles, git_of=self._rig))
+        first = Rig(CLUSTER, self._made("rig"), nodes=NODES, report=self._say)
+        self._rig = self._stack.enter_context(first)
+        second = Rig(FLEET, self._made("rig-fleet"), nodes=vehicles, git_of=first)
+        fleet = self._stack.enter_context(second)
         self._rigs = {CLUSTER: self._rig, FLEET: fleet}
         self._domains = {"cloud": self._stack.enter_context(reserved())}
         self._say(f"two clusters are up, with {len(vehicles) + len(NODES)} nodes")

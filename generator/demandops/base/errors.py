@@ -124,6 +124,14 @@ class StateRepoError(DemandOpsError):
     """Raised when the state repo cannot be read or written; the message says how to fix it."""
 
 
+class BeforeTheFirst(StateRepoError):
+    """Raised for a time before the first commit."""
+
+    def __init__(self, message: str, first: str) -> None:
+        super().__init__(message)
+        self.first = first  # the commit
+
+
 class Withdrawn(DemandOpsError):
     """Raised when a demand is canceled, released or replaced before its commit."""
 

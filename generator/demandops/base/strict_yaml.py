@@ -282,10 +282,13 @@ def set_key(text: str, key: str, value: object) -> str:
 
 
 def set_flag(text: str, items: str, id: str, key: str, value: bool) -> str:
-    """Return a file's text with a key of one item of a list set; the rest stays, with comments."""
+    """Return a file's text with a key of one item of a list set; the rest stays, with comments.
+
+    A key whose line has nothing else is taken away instead of set to false, which is the default.
+    """
     wanted, written = load(text), f"{key}: {str(value).lower()}"
-    found = (item for item in wanted[items] if item["id"] == id)
-    next(found)[key] = value
+    found = next(item for item in wanted[items] if item["id"] == id)
+    found[key] = value
     root: Any = yaml.compose(text, Loader=_CLoader)
     for item in next(each for node, each in root.value if node.value == items).value:
         entries = {node.value: (node, each) for node, each in item.value}
@@ -293,6 +296,10 @@ def set_flag(text: str, items: str, id: str, key: str, value: bool) -> str:
             continue
         if key in entries:
             start, end = entries[key][0].start_mark.index, entries[key][1].end_mark.index
+            first, last = text.rfind("\n", 0, start) + 1, text.find("\n", end) + 1
+            if not value and last and not text[first:start].strip():
+                del found[key]
+                start, end, written = first, last, ""
             changed = f"{text[:start]}{written}{text[end:]}"
         elif item.flow_style:
             end = entries["id"][1].end_mark.index

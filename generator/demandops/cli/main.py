@@ -102,7 +102,7 @@ _LEADS = {
     "override create NAME --on NODE": "move",
     "override create NAME --refuse-new --until 2h": "freeze",
     "override create NAME --replicas N": "scale",
-    "override create NAME --use-version VERSION": "pin",
+    "override create NAME --use-version VERSION, or with --image NAME=TAG": "pin",
     "override create NAME --values FILE": "edit patch",
     "reconcile CLUSTER": "sync",
     "release DEMAND|APPLICATION": "cancel delete remove rm stop uninstall",

@@ -268,7 +268,7 @@ class Connection:
 # ---- the interface of a connection type, and of the clients that it plans ----
 #
 # Each type has a module with a subclass of :class:`ConnectionType`, which plans clients as data.
-# :mod:`.manifests` makes a client's file from that data and from ``templates/connections/<type>/``.
+# :mod:`.gitops` makes a client's file from that data and from ``templates/connections/<type>/``.
 # In that folder, ``client.yaml.j2`` is the template of a Deployment with the client's name, and
 # ``schema.json`` lists the fields that the client's program reads.
 
@@ -323,7 +323,7 @@ class Client(ABC):
         return strict_yaml.dump(configuration)
 
     def settings(self, config: Config) -> ClientSettings:
-        settings = config.clients.of(self.type.word)
+        settings: ClientSettings = getattr(config.clients, self.type.word, ClientSettings())
         for file, patch in self.shaping.patches:
             settings = patched_settings(settings, patch, file)
         return settings
@@ -387,8 +387,9 @@ _LONGEST_TOPICS = 120
 class ConnectionType(ABC):
     """How clients carry a connection. Each subclass has one instance."""
 
-    # The type's name in messages; files, templates and clients use `word` instead
+    # The type's name in messages, and in files, templates and clients
     name: ClassVar[str]
+    word: ClassVar[str]
     # The type's number in `DeploymentRequest`
     number: ClassVar[int]
     # The name of the clients' image in the registry
@@ -411,10 +412,6 @@ class ConnectionType(ABC):
 
     def __repr__(self) -> str:
         return self.name
-
-    @property
-    def word(self) -> str:
-        return self.name.lower()
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
         return iter(())

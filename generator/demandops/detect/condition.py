@@ -42,7 +42,7 @@ def entity_in(pattern: str, topic: str) -> str | None:
 #
 # A condition on a number has a value at which it starts and a value at which it stops. If both
 # differ, a number that varies around one of them does not start and stop the condition again and
-# again. Only a threshold may have the same value for both.
+# again. Distances and thresholds may have one value for both.
 
 _FIELD = re.compile(r"[A-Za-z]\w*(\[[0-9]{1,9}\])*(\.[A-Za-z]\w*(\[[0-9]{1,9}\])*)*")
 
@@ -105,9 +105,9 @@ class _InArea(CamelModel):
 
 
 def _refuse_distances(limits: Any) -> Any:  # noqa: ANN401 - one of the two conditions
-    if limits.stop <= limits.start:
+    if limits.stop < limits.start:
         raise ValueError(
-            f"'stop' is {limits.stop:g}, but must be more than 'start', which is "
+            f"'stop' is {limits.stop:g}, but must not be less than 'start', which is "
             f"{limits.start:g}: between the two, the condition stays as it is, so that an entity "
             "near the limit does not start and stop it again and again"
         )
@@ -174,21 +174,29 @@ class Count(_InArea):
 
 
 class Threshold(CamelModel):
-    """A condition that starts if a number is above ``above``, or below ``below``.
+    """A condition that starts if a number is above ``above``, below ``below`` or in ``one_of``.
 
-    It stops if the number is back at ``stop``, or has passed ``stop`` on its way back.
+    It stops if the number is back at ``stop``, or has passed ``stop`` on its way back; with
+    ``one_of``, such as the cause codes of a warning, if the number is another one.
     """
 
     source: DnsLabel
     field: FieldPath
     above: Number | None = None
     below: Number | None = None
-    stop: Number
+    one_of: Annotated[tuple[Number, ...], Field(strict=False, min_length=1)] | None = None
+    stop: Number | None = None
 
     @model_validator(mode="after")
     def _has_hysteresis(self) -> Threshold:
-        if (self.above is None) == (self.below is None):
-            raise ValueError("must have exactly one of 'above' and 'below'")
+        if sum(each is not None for each in (self.above, self.below, self.one_of)) != 1:
+            raise ValueError("must have exactly one of 'above', 'below' and 'oneOf'")
+        if self.one_of is not None:
+            if self.stop is not None:
+                raise ValueError("'stop' belongs to 'above' and 'below'; leave it out")
+            return self
+        if self.stop is None:
+            raise ValueError("'stop' is missing; add the number at which the condition ends")
         if self.above is not None and self.stop > self.above:
             raise ValueError(
                 f"'stop' is {self.stop:g}, but must not be more than 'above', which is "
@@ -203,9 +211,13 @@ class Threshold(CamelModel):
 
     def is_past(self, value: float) -> bool:
         above, below = self.above, self.below
+        if self.one_of is not None:
+            return value in self.one_of
         return (above is not None and value > above) or (below is not None and value < below)
 
     def is_back(self, value: float) -> bool:
+        if self.stop is None:
+            return not self.is_past(value)
         return value <= self.stop if self.above is not None else value >= self.stop
 
 

@@ -143,25 +143,48 @@ class MessageReader:
         definition = file.sources[source]
         self._source = source
         self._entity = definition.entity and _getter(definition.entity)
-        self._position = definition.position and tuple(map(_getter, definition.position))
+        self._place, self._map = definition.position, file.map
+        self._position = self._place and (_getter(self._place.first), _getter(self._place.second))
+        unavailable = self._place.unavailable if self._place else definition.unavailable
+        self._unavailable = [(_getter(field), number) for field, number in unavailable.items()]
         thresholds = (rule.threshold for rule in file.rules)
         fields = {limits.field for limits in thresholds if limits and limits.source == source}
         self._fields = {field: _getter(field) for field in sorted(fields)}
 
-    def observation(self, message: Any, entity: str, at: float) -> Observation:  # noqa: ANN401
-        """Return what a message reports; ``entity`` is from the topic, empty if a field has it."""
+    def observation(
+        self,
+        message: Any,  # noqa: ANN401
+        entity: str,
+        at: float,
+    ) -> Observation | None:
+        """Return what a message reports, ``None`` if it says that the position is not known.
+
+        ``entity`` is from the topic, empty if a field has it.
+        """
+        for get, number in self._unavailable:
+            if _number(get(message)) == number:
+                return None
         if self._entity:
             entity = str(self._entity(message)).strip("/")
             if not is_entity(entity):
                 raise Unreadable(f"{entity[:60]!r} is not a name of an entity")
         position = None
-        if self._position:
+        if self._position and self._place:
             x, y = (_number(get(message)) for get in self._position)
+            if self._map and self._place.in_degrees:
+                x, y = self._metres(x * self._place.scale, y * self._place.scale)
             if abs(x) > _FARTHEST_M or abs(y) > _FARTHEST_M:
                 raise Unreadable(f"the position is more than {_FARTHEST_M:g} m from the origin")
             position = x, y
         values = {field: _number(get(message)) for field, get in self._fields.items()}
         return Observation(self._source, entity, at, position, values)
+
+    def _metres(self, latitude: float, longitude: float) -> tuple[float, float]:
+        is_on_earth = abs(latitude) <= 90 and abs(longitude) <= 180
+        metres = self._map.metres(latitude, longitude) if self._map and is_on_earth else None
+        if metres is None:
+            raise Unreadable(f"latitude {latitude:g}, longitude {longitude:g} is not on the map")
+        return metres
 
 
 def _number(value: object) -> float:

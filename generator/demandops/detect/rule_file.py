@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import Annotated, Any, Literal, TypeAlias
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -17,7 +18,8 @@ from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.base.strict_yaml import located_in
 from demandops.detect import condition as conditions
-from demandops.detect.condition import Count, FieldPath, Hours, Near, Threshold, Together
+from demandops.detect.condition import Count, FieldPath, Hours, Near, Number, Threshold, Together
+from demandops.detect.map_frame import MapFrame
 from demandops.model.config import base_model
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, matches
 from demandops.model.config.policy import Duration, Patterns
@@ -283,11 +285,43 @@ def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fau
 # are compared only if the fields are valid, and a demand's form is checked only if its names are
 # known.
 
-# For some message types, the fields that have x and y; a source can name other fields instead.
-POSITIONS: Mapping[str, tuple[str, str]] = {
-    "geometry_msgs/msg/PoseStamped": ("pose.position.x", "pose.position.y"),
-    "nav_msgs/msg/Odometry": ("pose.pose.position.x", "pose.pose.position.y"),
-    "perception_msgs/msg/EgoData": ("state.continuous_state[0]", "state.continuous_state[1]"),
+
+class PositionFields(NamedTuple):
+    """The two fields of a message with a position: x and y in metres, or degrees.
+
+    Degrees, latitude first, are multiplied by ``scale``. If a field has the value that
+    ``unavailable`` gives it, the message says that the position is not known.
+    """
+
+    first: str
+    second: str
+    scale: float = 0.0
+    unavailable: Mapping[str, float] = MappingProxyType({})
+
+    @property
+    def in_degrees(self) -> bool:
+        return bool(self.scale)
+
+
+_ETSI = "cam.cam_parameters.basic_container.reference_position"
+
+# For some message types, the fields that have the position; a source can name other fields.
+POSITIONS: Mapping[str, PositionFields] = {
+    "geometry_msgs/msg/PoseStamped": PositionFields("pose.position.x", "pose.position.y"),
+    "nav_msgs/msg/Odometry": PositionFields("pose.pose.position.x", "pose.pose.position.y"),
+    "perception_msgs/msg/EgoData": PositionFields(
+        "state.continuous_state[0]", "state.continuous_state[1]"
+    ),
+    "sensor_msgs/msg/NavSatFix": PositionFields(
+        "latitude", "longitude", 1.0, {"status.status": -1}
+    ),
+    # in units of 0.1 microdegree, with a number of its own for a position that is not known
+    "etsi_its_cam_msgs/msg/CAM": PositionFields(
+        f"{_ETSI}.latitude.value",
+        f"{_ETSI}.longitude.value",
+        1e-7,
+        {f"{_ETSI}.latitude.value": 900_000_001, f"{_ETSI}.longitude.value": 1_800_000_001},
+    ),
 }
 
 
@@ -295,8 +329,10 @@ class Source(CamelModel):
     """The topics on which one kind of entity reports.
 
     If ``topic`` contains ``{entity}``, a topic has the entity's name at that place. If not,
-    ``entity`` is the message's field with the entity's name. ``x`` and ``y`` are the fields with
-    the entity's position. An entity counts as gone when it has been silent for ``timeout``.
+    ``entity`` is the message's field with the entity's name. The entity's position is in the
+    fields ``x`` and ``y``, in metres, or ``latitude`` and ``longitude``, in degrees after they are
+    multiplied by ``scale``. A message in which a field has its number in ``unavailable`` counts as
+    silence. An entity counts as gone when it has been silent for ``timeout``.
     """
 
     topic: Annotated[Text, base_model.without(conditions.topic_pattern_problem)]
@@ -304,6 +340,10 @@ class Source(CamelModel):
     entity: FieldPath | None = None
     x: FieldPath | None = None
     y: FieldPath | None = None
+    latitude: FieldPath | None = None
+    longitude: FieldPath | None = None
+    scale: Annotated[float, Field(gt=0, le=1)] | None = None
+    unavailable: dict[FieldPath, Number] = Field(default_factory=dict)
     timeout: Duration = "5s"
 
     @model_validator(mode="after")
@@ -316,13 +356,25 @@ class Source(CamelModel):
             )
         if bool(self.x) != bool(self.y):
             raise ValueError("names x or y alone; give both, or neither")
+        if bool(self.latitude) != bool(self.longitude):
+            raise ValueError("names latitude or longitude alone; give both, or neither")
+        if self.x and self.latitude:
+            raise ValueError("names both x and latitude; give metres or degrees")
+        if self.scale is not None and not self.latitude:
+            raise ValueError("scale belongs to latitude and longitude; leave it out, or add them")
         if base_model.seconds_of(self.timeout) < 1:
             raise ValueError("timeout must be one second or more")
         return self
 
     @property
-    def position(self) -> tuple[str, str] | None:
-        return (self.x, self.y) if self.x and self.y else POSITIONS.get(self.type)
+    def position(self) -> PositionFields | None:
+        if self.x and self.y:
+            return PositionFields(self.x, self.y, unavailable=self.unavailable)
+        if self.latitude and self.longitude:
+            scale = self.scale or 1.0
+            return PositionFields(self.latitude, self.longitude, scale, self.unavailable)
+        usual = POSITIONS.get(self.type)
+        return usual and usual._replace(unavailable={**usual.unavailable, **self.unavailable})
 
 
 # The identity of an entity: its source and its name.
@@ -424,6 +476,8 @@ class RuleFile(FileModel):
     """Sources by name, and the rules that read them."""
 
     kind: Literal["DetectorRules"]
+    # Where the metres of rules are on earth, for sources that report degrees
+    map: MapFrame | None = None
     sources: dict[DnsLabel, Source] = Field(default_factory=dict)
     rules: Items[Rule]
 
@@ -439,6 +493,13 @@ def read(text: str, file: str) -> RuleFile:
 def _faults(rules: RuleFile) -> Iterator[Fault]:
     names: set[str] = set()
     ids: list[tuple[str, Rule]] = []
+    for name, listed in rules.sources.items():
+        if rules.map is None and listed.position and listed.position.in_degrees:
+            message = (
+                "reports degrees; add to the file where its metres are on earth, such as "
+                "'map: {latitude: 50.7784, longitude: 6.0606}'"
+            )
+            yield fault(f"sources.{name}", message)
     for index, rule in enumerate(rules.rules):
         where = f"rules[{index}]"
         if rule.name in names:
@@ -454,7 +515,7 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
             elif source is not None and kind != "threshold" and not rules.sources[source].position:
                 message = (
                     f"source '{source}' has no position; name the fields of its position in "
-                    f"sources.{source}.x and y"
+                    f"sources.{source}: x and y, or latitude and longitude"
                 )
                 yield fault(f"{where}.{kind}.{part}", message)
         field = "demand" if rule.demand is not None else "deploymentRequest"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
@@ -15,9 +16,9 @@ from demandops.base import naming, settings
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import with_lines
-from demandops.decide.changeset import FileReader
-from demandops.decide.state import rendered_files
+from demandops.decide.state import FileReader, rendered_files
 from demandops.model.config.config import Config
+from demandops.model.config.override import OVERRIDES_ROOT, override_selects
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import verification
 from demandops.repo.git import repository as repositories
@@ -232,6 +233,27 @@ class Reader:
         claims = (valid_claim_at(tree, path) for path in paths for tree in (before, after))
         return any(claim is not None and claim.held.needs(node) for claim in claims)
 
+    def edits(self, entry: LogEntry, kind: str, name: str) -> bool:
+        """Return whether a commit changes an override that selects a thing, or a node's entry.
+
+        It is by a person, or by a generator that ends an override.
+        """
+        if entry.by_generator and entry.first("Operation") != "expire-override":
+            return False
+        commit = trees.commit_of(self.objects, entry.commit)
+        sides = trees.parent_tree(commit), commit.tree
+        roots = (OVERRIDES_ROOT, "inventory") if kind == "node" else (OVERRIDES_ROOT,)
+        paths = {path for path, _ in trees.differences(*sides, roots)}
+        for path in paths | {*entry.trailers.get("Override", ())}:
+            texts = [trees.read_text(side, path) or "" for side in sides]
+            if path.startswith(f"{OVERRIDES_ROOT}/"):
+                if any(override_selects(text, kind, name) for text in texts):
+                    return True
+            # as text, because a large inventory takes long to parse, and has many versions
+            elif len({_item(text, name) for text in texts}) > 1:
+                return True
+        return False
+
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
         since, follows = entry.first("Since"), entry.first("Follows")
         if not (entry.by_generator and since and follows):
@@ -241,6 +263,12 @@ class Reader:
 
     def operator(self) -> Person:
         return commit_log.operator(self.objects.path)
+
+
+def _item(text: str, id: str) -> str:
+    named = re.compile(rf"\bid: *['\"]?{re.escape(id)}(?![\w/.-])")
+    items = re.split(r"(?m)^(?=\s*- )", text)
+    return next((item.strip() for item in items if named.search(item)), "")
 
 
 @contextmanager

@@ -200,7 +200,7 @@ class Ticket:
         if stage in ("proposed", "pushed"):
             log.info("%s: %s", name, text)
         elif stage == "refused":
-            log.error("%s: refused: %s", name, text)
+            log.warning("%s: refused: %s", name, text)
 
 
 # ---- the journal: all accepted, unpublished demands, so that a crash loses none ----

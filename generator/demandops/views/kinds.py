@@ -28,7 +28,9 @@ from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
+from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry
+from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.views import vocabulary
 from demandops.views.rows import Column, Row, TextsOf
 from demandops.views.source import Source, since_of, word_of, worst_word
@@ -51,6 +53,12 @@ class Kind:
     # Further texts by which an item is found, by label.
     labels: Callable[[Json], dict[str, Iterable[str]]] = lambda item: {}
     trailer: str = ""  # of commits: names what their commit changes, so that its past can be listed
+    # What an item has that is gone, beside nulls; None if its past cannot be listed.
+    blank: Json | None = None
+
+    @property
+    def has_past(self) -> bool:
+        return bool(self.trailer) or self.blank is not None
 
     @property
     def word(self) -> str:
@@ -92,34 +100,51 @@ def rows_of(source: Source, name: str) -> list[Row]:
     return [row for _, row in made.values()]
 
 
+# The operations that end what their commit names.
+_ENDING = frozenset({"shutdown", "release", "expire", "decommission", "rollback"})
+
+
 def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
     """Return what is gone, the newest first, and the commit where the search ended, if it did.
 
-    The newest commit that names a thing which is not there now is the one that ended it.
+    The newest commit that names a thing which is not there now is the one that ended it. What came
+    back is listed too: nothing of it ended since what is there now began.
     """
-    kind, past = KINDS[name], dict[str, Json]()
-    present = {row.item["name"] for row in rows_of(source, name)}
-    for number, entry in enumerate(source.reader().log(source.commit)):
+    kind, past, reader = KINDS[name], dict[str, Json](), source.reader()
+    began: dict[str, datetime | None] = {}  # what is there now; None if it was never gone
+    for row in rows_of(source, name):
+        since = row.item.get("since") if kind.trailer else None
+        began[row.item["name"]] = parse_time(since) if since else None
+    stopped = (
+        commit_log.stopped_releases(reader.objects, source.commit) if name == "releases" else {}
+    )
+    for number, entry in enumerate(reader.log(source.commit)):
         if number == MOST_COMMITS:
             return [*map(kind.row, past.values())], entry.commit
-        trailers = entry.trailers
-        named = trailers.get(kind.trailer, ())
-        for gone in (each for each in named if each not in present):
-            ended = {
-                "time": time_data(entry.time),
-                "by": entry.author,
-                "operation": entry.first("Operation") or None,
-                "commit": entry.commit,
-            }
-            item: Json = {column.key: None for column in kind.columns}
-            item |= {"name": gone, "state": "gone", "ended": ended, "requesters": []}
-            item |= {"applications": [], "connections": []}
+        by, time, operation = entry.author, entry.time, entry.first("Operation")
+        named = entry.trailers.get(kind.trailer, stopped.get(entry.commit, ()))
+        if name == "proposals" and entry.answer:
+            by, time, operation = entry.answer.by, entry.answer.time, entry.answer.outcome
+            # of a rejection, the branch and the commit that was proposed
+            named = named or [entry.first(REJECTS).partition(" ")[0]]
+        for gone in named:
+            if gone in began:
+                now = began[gone]
+                if now and entry.time > now and operation in _ENDING:
+                    began[gone] = now = None
+                if now is None or (gone not in past and operation not in _ENDING):
+                    continue
+            item: Json = {column.key: None for column in kind.columns} | (kind.blank or {})
+            item |= {"name": gone, "state": "back" if gone in began else "gone"}
+            item |= {"requesters": [], "applications": [], "connections": []}
+            item["ended"] = {"time": time_data(time), "by": by, "operation": operation or None}
+            item["ended"]["commit"] = entry.commit
             item = past.setdefault(gone, item)
             item["since"] = time_data(entry.time)  # of the oldest commit that names it
             if len(named) == 1 and not item["requesters"]:  # what a commit names is all of it
-                item["requesters"] = trailers.get("Requester", [])
-                item["applications"] = trailers.get("Application", [])
-                item["connections"] = trailers.get("Connection", [])
+                item["requesters"] = entry.trailers.get("Requester", [])
+                item["applications"] = entry.trailers.get("Application", [])
+                item["connections"] = entry.trailers.get("Connection", [])
     return [*map(kind.row, past.values())], ""
 
 
@@ -167,7 +192,7 @@ def _wide(key: str, title: str, links: str = "", texts_of: TextsOf | None = None
 
 def _command(title: str, words_of: Callable[[Json], list[str]]) -> Column:
     def text(item: Json, now: datetime) -> str:
-        return shlex.join(words_of(item))
+        return "" if item.get("ended") else shlex.join(words_of(item))
 
     return Column("name", title, 9, "command", text, only_wide=True)
 
@@ -674,12 +699,14 @@ KINDS: dict[str, Kind] = {
             "releases",
             "Helm releases and the clients of connections, each shared by all who need it.",
             (
-                *(_named("release"), HEALTH, Column("reason", "Reason", 1, texts_of=_reason)),
+                *(_named("release"), HEALTH, ENDED),
+                Column("reason", "Reason", 1, texts_of=_reason),
                 *(_NODE, replace(REQUESTERS, rank=4), _FOR, SINCE, _VERSION, _CLUSTER),
                 Column("seen", "Seen", 9, texts_of=lambda item, now: (item["seen"] or "")[:10]),
             ),
             _releases,
             _release,
+            blank={"versions_asked": {}, "application_version": None, "object": None},
         ),
         Kind(
             "services",
@@ -818,7 +845,7 @@ KINDS: dict[str, Kind] = {
             "proposals",
             "Changes that a person approves by merging a branch, or refuses by deleting it.",
             (
-                *(Column("name", "Branch"), _COMMIT, REQUESTERS),
+                *(Column("name", "Branch"), _COMMIT, ENDED, REQUESTERS),
                 *(Column("since", "Since", 3, "time"), Column("summary", "What", 1)),
                 *(Column("required_by", "Required by", 4), Column("link", "Link", 5)),
                 _wide("demands", "Demands", "demand"),
@@ -827,6 +854,8 @@ KINDS: dict[str, Kind] = {
                 _command("Refuse", lambda item: _decide(item, "reject")),
             ),
             _proposals,
+            trailer=PROPOSAL,
+            blank={"commit": ""},
         ),
         Kind(
             "events",

@@ -20,7 +20,7 @@ TONES = {
     **dict.fromkeys(("decision", "proposed", "waiting", "starting", "partly suspended"), "busy"),
     **dict.fromkeys(("overdue", "drained", "expired"), "busy"),
     **dict.fromkeys(("held back", "matches nothing", "not rendered yet"), "busy"),
-    **dict.fromkeys(("unknown", "kept", "open", "gone"), "none"),
+    **dict.fromkeys(("unknown", "kept", "open", "gone", "back"), "none"),
     **dict.fromkeys(("healthy", "held", "runs", "used", "in force", "approved", "exists"), "good"),
 }
 RANKS = {word: float(place) for place, word in enumerate(TONES)}

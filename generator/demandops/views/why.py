@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from demandops.base.errors import (
     DemandOpsError,
@@ -61,6 +61,8 @@ _TOLD_APART = KINDS[:3]
 _MOST_LISTED = 8
 # The trailer that names the thing in the commits that are about it.
 _TRAILERS = {"demand": "Demand-Id", "requester": "Requester"}
+# What an override selects by name.
+_SELECTED = ("requester", "application", "connection", "service", "appdef", "node")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,12 +98,15 @@ def find(source: Source, name: str, kind: str | None = None) -> Thing:
     # a part of a release's name, or the start of a demand's id; what runs before what has ended
     running = sorted(release for release in source.releases if name in release)
     demands = sorted(id for id in _demands(source) if id.startswith(name))
-    ended = sorted(commit_log.stopped_release_names(reader.objects, source.commit))
+    stopped = commit_log.stopped_releases(reader.objects, source.commit).values()
+    ended = sorted({release for names in stopped for release in names})
     were = [release for release in ended if name in release]
+    past = {id for entry in reader.log(source.commit) for id in entry.trailers.get("Demand-Id", ())}
     for each, names, what in (
         ("release", running, "releases have {} in their name"),
         ("demand", demands, "demand ids begin with {}"),
         ("release", were, "releases have {} in their name"),
+        ("demand", sorted(id for id in past if id.startswith(name)), "demand ids begin with {}"),
     ):
         if kind in (None, each) and names:
             if len(names) > 1:
@@ -454,6 +459,13 @@ def _past(source: Source, reader: Reader, thing: Thing, most: int) -> Json:
         history = PathHistory(started, tuple(about[:most]), more, stopped)
     elif thing.path:
         history = reader.history(thing.path, source.commit, most)
+    if thing.kind in _SELECTED:
+        log, listed = reader.log(source.commit), {entry.commit for entry in history.newest}
+        edits = (entry for entry in log if reader.edits(entry, thing.kind, thing.name))
+        newest = [*history.newest, *(entry for entry in edits if entry.commit not in listed)]
+        newest.sort(key=lambda entry: entry.time, reverse=True)
+        more = history.more + max(len(newest) - most, 0)
+        history = replace(history, newest=tuple(newest[:most]), more=more)
 
     def row(entry: LogEntry | None) -> Json | None:
         if entry is None:

@@ -142,7 +142,8 @@ class SourceSubscriptions:
     def _read(self, source: str, topic: str, entity: str, message: Any) -> None:  # noqa: ANN401
         self.messages += 1
         try:
-            self._observe(self._readers[source].observation(message, entity, self._now()))
+            if heard := self._readers[source].observation(message, entity, self._now()):
+                self._observe(heard)
         except Unreadable as error:
             self.unreadable += 1
             self._tell_once(f"a message on {topic} is left out: {error}")

@@ -92,7 +92,9 @@ class RecordedBag:
                     self._leave_out(connection.topic, f"cannot be decoded: {error!r}")
                     continue
                 try:
-                    yield self._readers[source].observation(message, entity, nanoseconds / 1e9)
+                    reader = self._readers[source]
+                    if heard := reader.observation(message, entity, nanoseconds / 1e9):
+                        yield heard
                 except Unreadable as error:
                     self._leave_out(connection.topic, str(error))
 

@@ -10,18 +10,28 @@ import logging
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.serve import agenda
+from demandops.model.demand import goals as demand_goals
+from demandops.repo.git.repository import StateRepository
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.serve import agenda, worker
+from demandops.serve.agenda import Agenda
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Ticket
+from demandops.templating.evaluator import processor_time
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock
+from tests.kit.repo import Person
 
+ROOT = "appdefs/object-detection-fusion"
+APPDEF, TEMPLATE = f"{ROOT}/appdef.yaml", f"{ROOT}/values/object-fusion.yaml.j2"
+NODES, POLICY, SETTINGS = "inventory/nodes.yaml", "policy/access-domains.yaml", "demandops.yaml"
+ENDLESS = "{% for a in range(99999) %}{% for b in range(99999) %}{% endfor %}{% endfor %}"
 LOOKS = 400
 """After so many looks at the clock, the time of a decision is over."""
 
@@ -30,36 +40,39 @@ class Ticking(Clock):
     look_s = 0.5 / LOOKS
 
 
-def large(name: str) -> dict[str, Any]:
-    """Return a demand with 1,000 placements and 1,000 connections."""
-    inputs = {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]}
-    app = {"type": "object-detection-fusion", "place": {"role": "edge"}, "inputs": inputs}
+def connections(name: str, count: int = 1000) -> dict[str, Any]:
     link = {"type": "mqtt", "source": "vehicle00", "target": "edge"}
+    made = [
+        link | {"id": f"{name}-{number}", "topics": [{"source": f"/{name}/t{number}"}]}
+        for number in range(count)
+    ]
+    return {"kind": "Demand", "demand": name, "requesters": ["attacker"], "connections": made}
+
+
+def placed(id: str) -> dict[str, Any]:
+    inputs = {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]}
     return {
-        "kind": "Demand",
-        "demand": name,
-        "requesters": ["attacker"],
-        "applications": [app | {"id": f"{name}-{number}"} for number in range(1000)],
-        "connections": [
-            link | {"id": f"{name}-{number}", "topics": [{"source": f"/{name}/t{number}"}]}
-            for number in range(1000)
-        ],
+        "id": id,
+        "type": "object-detection-fusion",
+        "place": {"role": "edge"},
+        "inputs": inputs,
     }
 
 
-def connections(name: str) -> dict[str, Any]:
-    return large(name) | {"applications": []}
+def placements(name: str) -> dict[str, Any]:
+    apps = [placed(f"{name}-{number}") for number in range(1000)]
+    return connections(name) | {"applications": apps}
 
 
 def booked_in_time(name: str) -> dict[str, Any]:
     """Return a demand that is admitted in time, and not rendered in time."""
-    return connections(name) | {"connections": connections(name)["connections"][: LOOKS // 2]}
+    return connections(name, LOOKS // 2)
 
 
 def too_many_topics(name: str) -> dict[str, Any]:
-    made = connections(name)
-    topics = [{"source": f"/t{number}"} for number in range(19_000)]
-    return made | {"connections": [made["connections"][0] | {"topics": topics}]}
+    made = connections(name, 1)
+    made["connections"][0]["topics"] = [{"source": f"/t{number}"} for number in range(19_000)]
+    return made
 
 
 Send = Callable[..., Ticket]
@@ -76,7 +89,7 @@ def sender(generator: Generator, order: list[str]) -> Send:
     return send
 
 
-@pytest.mark.parametrize("made", [large, connections, too_many_topics])
+@pytest.mark.parametrize("made", [placements, connections, too_many_topics])
 def test_who_sends_what_takes_too_long_holds_up_others_for_one_demand(
     bare: Path, made: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,13 +147,12 @@ generator.submit(json.load(sys.stdin), "op-large").future.result(60)
 """
 
 
-@pytest.mark.parametrize("made", [large, connections])
 def test_after_a_kill_in_the_middle_it_is_refused_and_leaves_the_journal(
-    bare: Path, made: Any, caplog: pytest.LogCaptureFixture
+    bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     killed = subprocess.run(
         [sys.executable, "-c", DIES, str(bare)],
-        input=json.dumps(made("d")),
+        input=json.dumps(placements("d")),
         text=True,
         check=False,
         timeout=rig.PATIENCE_S,
@@ -172,3 +184,71 @@ def test_what_was_decided_is_published_before_a_large_demand_is_begun(
         ]
     assert [rig.outcome(ticket) for ticket in sent] == ["booked", "booked"]
     assert told.index(("small", "pushed")) < told.index(("large", "admitted"))
+
+
+def test_a_rollback_may_take_longer_than_a_demand(
+    generator: Generator, bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "DEMAND_S", 0.05)  # all services together take longer
+    demands = [
+        goals.goal([goals.application(f"edge/f-{number}")], id=f"demand-{number}")
+        for number in range(60)
+    ]
+    rig.book(generator, *demands)
+    then = rig.tip(bare)
+    rig.book(generator, *(demand | {"shutdown": True} for demand in demands))
+    who = ("A person", "person@example.org")
+    back = demand_goals.rollback(then, drop_newer=False, reason="a test", who=who)
+    assert rig.receipt(generator.submit(back)).outcome == "restored"
+
+
+# ---- demands that wait for room ----
+
+
+@pytest.fixture
+def crowded(bare: Path, person: Person, clock: Clock) -> Iterator[Generator]:
+    """A generator of a full edge: the demand `a` is booked, and `b` to `f` wait for room."""
+    service, domain = "  object-fusion:\n", "    namespace: perception\n"
+    patient = f"{person.read(SETTINGS)}limits: {{decisionMilliseconds: 1000000}}\n"
+    edits = {
+        APPDEF: (service, f"{service}    requests: {{cpu: 1}}\n"),
+        NODES: ("- id: edge\n", "- id: edge\n    capacity: {cpu: 1}\n"),
+        POLICY: (domain, f"{domain}    whenFull: wait\n"),
+    }
+    changed = {path: person.read(path).replace(*edit) for path, edit in edits.items()}
+    person.change(changed | {SETTINGS: patient})
+    demands = [connections(name, 0) | {"applications": [placed(name)]} for name in "abcdef"]
+    with rig.running(bare, runtime=clock) as generator:
+        rig.book(generator, *demands)
+        yield generator
+
+
+def runs(bare: Path) -> list[str]:
+    return sorted(rig.books(bare)["services"])
+
+
+def test_waiting_demands_are_tried_in_rounds_until_all_were_tried(
+    crowded: Generator, bare: Path, person: Person, clock: Clock
+) -> None:
+    assert runs(bare) == ["of-a"]
+    clock.look_s = 1.0  # so a round is over once it has tried one demand
+    person.change({NODES: person.read(NODES).replace("{cpu: 1}", "{cpu: 9}")})
+    crowded.fetch_now()
+    rig.wait_until(lambda: len(runs(bare)) == 6, "all waiting demands to be booked")
+
+
+def test_a_round_ends_with_a_demand_whose_template_takes_too_long(
+    crowded: Generator, bare: Path, person: Person
+) -> None:
+    nodes, template = person.read(NODES).replace("{cpu: 1}", "{cpu: 9}"), person.read(TEMPLATE)
+    person.change({NODES: nodes, TEMPLATE: ENDLESS + template}, "Room, and no end")
+    rig.book(crowded, goals.link(1))
+    # two threads must not use one repository
+    own = StateRepository(bare)
+    turns = Agenda(0, own.runtime)
+    with processor_time(0.1):
+        turns.book_waiting(CommitBatch(own, crowded.snapshot))
+    assert turns.left
+    person.change({TEMPLATE: template}, "An end")
+    rig.book(crowded, goals.link(2))
+    rig.wait_until(lambda: len(runs(bare)) == 6, "all waiting demands to be booked")

@@ -13,19 +13,10 @@ from demandops.base.errors import QueueFull
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
-from tests.kit.cli import Run
 from tests.kit.git_over_http import Server
 from tests.kit.rig import Person, Stages, goal
 
-NODES, SOON_S = "inventory/nodes.yaml", 0.1
-
-
-def followed(bare: Path, made: str) -> str:
-    """Wait until a generator has followed a person's commit; return the generator's commit."""
-    rig.wait_until(lambda: rig.tip(bare) != made, "the generator follows")
-    (commit,) = [c for c in rig.commits(bare, f"{made}..main") if c.one("Operation") == "follow"]
-    assert commit.one("Follows") == made
-    return commit.id
+SOON_S = 0.1
 
 
 def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> None:
@@ -36,8 +27,9 @@ def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> 
         rig.book(off, goal(1))
         known = str(off.snapshot.commit)
         made = person.edit("inventory/brokers.yaml", "service-mqtt-broker-edge", "elsewhere")
-        commit = followed(bare, made)
-        rig.wait_until(lambda: str(on.snapshot.commit) == commit, "the other generator follows")
+        rig.wait_until(lambda: rig.tip(bare) != made, "the other generator follows")
+        commit = rig.tip(bare)
+        rig.wait_until(lambda: str(on.snapshot.commit) == commit, "the other generator knows")
         assert str(off.snapshot.commit) == known
         off.fetch_now()  # as after a webhook's call
         rig.wait_until(lambda: str(off.snapshot.commit) == commit, "the generator follows now")
@@ -65,41 +57,23 @@ def test_a_fetch_that_hangs_delays_no_demand(http: str, server: Server, bare: Pa
     rig.assert_sound(bare)
 
 
-def test_stopping_does_not_wait_for_a_look_that_hangs(http: str, server: Server) -> None:
-    generator = Generator(http, fetch_interval=SOON_S)
+@pytest.mark.parametrize("sends", [False, True], ids=["a look", "a push"])
+def test_stopping_does_not_wait_for_a_server_that_never_answers(
+    http: str, server: Server, bare: Path, sends: bool
+) -> None:
+    generator = Generator(http, fetch_interval=0 if sends else SOON_S)
     hang = server.faults.hang = threading.Event()
     try:
-        rig.wait_until(lambda: generator._repository._process, "a fetch is under way and hangs")  # type: ignore[attr-defined]
-        assert generator.stop(timeout=2 * rig.PATIENCE_S).result(rig.PATIENCE_S) is True
+        if sends:
+            generator.submit(goal(1), "op-1")
+        rig.wait_until(lambda: server.faults.hanging, "the server has a request")
+        stopped = generator.stop(timeout=0.5 if sends else 2 * rig.PATIENCE_S)
+        assert stopped.result(rig.PATIENCE_S) is not sends
     finally:
         server.faults.hang = None
         hang.set()
-
-
-def test_a_goal_is_told_why_it_waits_and_can_be_taken_back_meanwhile(
-    http: str, server: Server, bare: Path
-) -> None:
-    with rig.running(http, fetch_interval=SOON_S) as generator:
-        rig.book(generator, goal(1))
-        server.faults.away = True
-        rig.wait_until(
-            lambda: generator.remote_status.unreachable, "the remote is known to be away"
-        )
-        stages = Stages()
-        stays = generator.submit(goal(2), "op-2")
-        goes = generator.submit(goal(3), "op-3", stages)
-        rig.wait_until(lambda: stages.told, "the requester is told")
-        ((stage, text),) = stages.told
-        assert stage == "away" and http in text and "503" in text
-        assert generator.withdraw("op-3") is True
-        assert rig.outcome(goes) == "Withdrawn"
-        assert not stays.future.done()
-        assert generator.snapshot.state.ledger.claims_of_requester("user1"), (
-            "the known state must stay readable"
-        )
-        server.faults.away = False
-        assert rig.outcome(stays) == "booked"
-    assert rig.operations(bare)[-1] == "op-2"
+    assert rig.restart(http) is True
+    assert rig.operations(bare) == ["op-1"] * sends
 
 
 def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server) -> None:
@@ -115,27 +89,3 @@ def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server) ->
         with pytest.raises(QueueFull, match=r"503"):
             rig.receipt(refused)
         server.faults.away = False
-
-
-# ---- what the command line reports ----
-
-
-def test_views_go_on_while_something_is_not_valid_and_say_so(
-    bare: Path, person: Person, demandops: Run
-) -> None:
-    first = "  - id: vehicle00\n    type: vehicle\n    cluster: "
-    with rig.running(bare, fetch_interval=SOON_S) as generator:
-        rig.book(generator, goal(1))
-        made = person.edit(NODES, f"{first}c-its", f"{first}c-itz")
-        followed(bare, made)
-    status = demandops("status", "--state-repo", bare)
-    problem, mend = (line.strip() for line in status.out.splitlines()[1:3])
-    assert problem.startswith(f"{NODES}:") and f"(since {made[:10]} by Petra" in problem
-    assert mend.endswith(f"git revert --no-edit -m 1 {made[:10]}")
-    assert "of-edge-fusion-1" in status.out
-    assert (status.code, "problems in files: 1" in status.err) == (1, True)
-    (told,) = demandops("status", "--state-repo", bare, "--output", "json").json()["faults"]
-    assert (told["file"], told["field"], told["since"]) == (NODES, "nodes[0].cluster", made)
-    books = demandops("bookkeeping", "--state-repo", bare)
-    assert (books.code, "edge/fusion-1" in books.out) == (0, True)
-    assert books.err.splitlines() == [f"warning: not in effect: {problem}", f"warning: {mend}"]

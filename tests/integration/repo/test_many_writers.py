@@ -1,6 +1,6 @@
-"""Four generators and a person write to one state repo at once, while connections are cut.
+"""Several writers at one state repo at once: no demand is lost or counts twice.
 
-The load is small in `make test`; `make load` sends 2,000 demands and prints the figures of each
+The load is small in the gate; `make load` sends 2,000 demands and prints the figures of each
 writer.
 """
 
@@ -9,24 +9,27 @@ from __future__ import annotations
 import os
 import random
 import statistics
+import subprocess
 import threading
 import time
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
+from demandops.repo.git import repository
+from demandops.repo.git.objects import NewObjects
+from demandops.serve.generator import Generator
 
 from tests.kit import git_over_http, rig
 from tests.kit.limits import LONGEST_TEST_S
-from tests.kit.rig import Drivers, Goal
+from tests.kit.rig import Drivers, Person, demand, goal
 
 pytestmark = pytest.mark.synced
 
-GENERATORS = 4
 DEMANDS = int(os.environ.get("DEMANDOPS_LOAD_DEMANDS", "16"))
 SEED = int(os.environ.get("DEMANDOPS_LOAD_SEED", "1"))
-REQUESTERS = 4
-"""How many requesters each generator has; a requester sends again only after an answer."""
 CUTS = 0.01
 """The probability that an HTTP request is cut before the server handles it.
 
@@ -34,26 +37,51 @@ With the same probability, it is cut before the answer.
 """
 PERSONS_PAUSE_S = (0.5, 3.0) if DEMANDS > 100 else (0.2, 0.8)
 
+Lanes = list[list[dict[str, Any]]]
+"""The demands of a generator's requesters, each of whom sends again only after an answer."""
 
-def _lanes(who: int) -> list[list[tuple[str, Goal]]]:
-    """Return one generator's demands: a list for each of its :data:`REQUESTERS` requesters.
 
-    Of every three joins, one is followed by a leave.
-    """
-    lanes: list[list[tuple[str, Goal]]] = [[] for _ in range(REQUESTERS)]
-    for turn in range(DEMANDS // GENERATORS * 3 // 4):
-        number, lane = GENERATORS * turn + who, lanes[turn % REQUESTERS]
-        lane.append((f"join-{number}", rig.goal(number)))
+def lanes(generators: int, demands: int, requesters: int = 4) -> list[Lanes]:
+    """Return the lanes of each generator; of every three joins, one is followed by its leave."""
+    made: list[Lanes] = [[[] for _ in range(requesters)] for _ in range(generators)]
+    for number in range(demands * 3 // 4):
+        turn = number // generators
+        lane = made[number % generators][turn % requesters]
+        lane.append(demand(f"join-{number}", goal(number)))
         if turn % 3 == 2:
-            lane.append((f"leave-{number}", rig.leave(number)))
-    return lanes
+            lane.append(demand(f"leave-{number}", rig.leave(number)))
+    return made
+
+
+def assert_one_would_have_done_the_same(
+    bare: Path, sent: list[Lanes], told: list[rig.Told], pushed: list[str]
+) -> None:
+    demands = [one for each in sent for lane in each for one in lane]
+    answers = {name: answer for one in told for name, answer in one.answers.items()}
+    assert [a for a in answers.values() if a["outcome"] not in ("booked", "released")] == []
+    assert all(one.finished for one in told)
+    assert sorted(answers) == sorted(one["name"] for one in demands)
+    rig.assert_sound(bare, verify_last=20)
+    assert sorted(rig.operations(bare)) == sorted(one["operation"] for one in demands)
+    assert rig.books(bare) == rig.books_after(one["goal"] for one in demands)
+    there = rig.git(bare, "rev-list", "main").splitlines()
+    assert {answer["commit"] for answer in answers.values()} | {*pushed} <= {*there}
+
+
+def test_two_processes_on_one_machine_lose_and_double_nothing(
+    drivers: Drivers, bare: Path, data_home: Path
+) -> None:
+    sent = lanes(generators=2, demands=32)
+    told = rig.listen_to_all(drivers, [drivers.start(bare, each) for each in sent])
+    assert {path.name for path in next(data_home.iterdir()).iterdir()} == {"slot-0", "slot-1"}
+    assert_one_would_have_done_the_same(bare, sent, told, [])
 
 
 @dataclass
 class _Person:
     """A person who keeps changing the state repo, and repeats each push until it is accepted."""
 
-    person: rig.Person
+    person: Person
     pushed: list[str] = field(default_factory=list)
     tries: list[int] = field(default_factory=list)
 
@@ -78,65 +106,95 @@ class _Person:
 @pytest.mark.nightly
 @pytest.mark.limit(LONGEST_TEST_S + DEMANDS)
 def test_many_writers_end_where_one_would(
-    drivers: Drivers,
-    bare: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    drivers: Drivers, bare: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    lanes = [_lanes(who) for who in range(GENERATORS)]
-    over, dice = threading.Event(), random.Random(SEED)
-
-    def cuts() -> bool:
-        return dice.random() < CUTS
-
+    """Four generators and a person, while connections are cut."""
+    sent, over, dice = lanes(4, DEMANDS), threading.Event(), random.Random(SEED)
     with git_over_http.serving(bare.parent) as server:
-        person = _Person(rig.Person(bare, tmp_path / "person"))
+        person = _Person(Person(bare, tmp_path / "person"))
         started = time.monotonic()
-        runs = [
-            drivers.start(
-                f"{server.url}/{bare.name}",
-                [[rig.demand(*one) for one in lane] for lane in each],
-            )
-            for each in lanes
-        ]
+        runs = [drivers.start(f"{server.url}/{bare.name}", each) for each in sent]
         people = threading.Thread(target=person.work, args=(over,), daemon=True)
         people.start()
+
+        def begin_to_cut() -> None:
+            server.faults.cuts = lambda: dice.random() < CUTS
+
         try:
-            told = rig.listen_to_all(drivers, runs, lambda: setattr(server.faults, "cuts", cuts))
+            told = rig.listen_to_all(drivers, runs, begin_to_cut)
         finally:
             over.set()
         took = time.monotonic() - started
         people.join(rig.PATIENCE_S)
-        cut = server.cut
     with capsys.disabled():
-        _print(told, person, took, cut)
-    _assert_one_would_have_done_the_same(bare, lanes, told, person)
-    assert cut, "no connection was cut, so the test has tested nothing"
+        print(f"\n{DEMANDS} demands in {took:.1f} s, {server.cut} cuts")
+        for who, one in enumerate(told):
+            waits = statistics.median(one.waits.values()), max(one.waits.values())
+            print(f"  generator {who}: median {waits[0]:.2f} s, longest {waits[1]:.2f} s")
+        print(f"  person: {len(person.pushed)} pushed, most tries {max(person.tries)}")
+    assert_one_would_have_done_the_same(bare, sent, told, person.pushed)
+    assert server.cut, "no connection was cut, so the test has tested nothing"
 
 
-def _assert_one_would_have_done_the_same(
-    bare: Path, lanes: list[list[list[tuple[str, Goal]]]], told: list[rig.Told], person: _Person
+@pytest.mark.parametrize("after", ["the tip was read", "the branch was read"])
+def test_what_another_writer_publishes_in_the_last_moment_is_not_overwritten(
+    bare: Path, person: Person, monkeypatch: pytest.MonkeyPatch, after: str
 ) -> None:
-    demands = [one for each in lanes for lane in each for one in lane]
-    answers = {name: answer for one in told for name, answer in one.answers.items()}
-    assert [a for a in answers.values() if a["outcome"] not in ("booked", "released")] == []
-    assert [one.finished for one in told] == [True] * GENERATORS
-    assert sorted(answers) == sorted(name for name, _ in demands)
-    rig.assert_sound(bare, verify_last=20)
-    assert sorted(rig.operations(bare)) == sorted(f"op-{name}" for name, _ in demands)
-    assert rig.books(bare) == rig.books_after(made for _, made in demands)
-    assert person.pushed
-    there = rig.git(bare, "rev-list", "main").splitlines()
-    assert {answer["commit"] for answer in answers.values()} | {*person.pushed} <= {*there}
+    """Between a generator's last look at main and its own move of it."""
+    places: dict[str, tuple[Any, str]] = {
+        "the tip was read": (repository, "needs_push"),
+        "the branch was read": (NewObjects, "packed"),
+    }
+    owner, name = places[after]
+    last, moved = getattr(owner, name), list[str]()
+
+    def then(*given: Any) -> Any:
+        if not moved:
+            moved.append("")
+            moved[:] = [person.change({"README.md": "In the last moment\n"})]
+        return last(*given)
+
+    with rig.running(bare) as generator:
+        monkeypatch.setattr(owner, name, then)
+        rig.book(generator, goal(1))
+    assert rig.git(bare, "merge-base", "--is-ancestor", moved[0], "main") == ""
+    rig.assert_sound(bare)
 
 
-def _print(told: list[rig.Told], person: _Person, took: float, cut: int) -> None:
-    print(f"\n{DEMANDS} demands in {took:.1f} s ({DEMANDS / took:.0f} a second), {cut} cuts")
-    start = min(one.first for one in told)
-    for who, one in enumerate(told):
-        waits = sorted(one.waits.values())
-        print(
-            f"  generator {who}: {len(waits)} answered, the last after {one.last - start:.1f} s; "
-            f"median {statistics.median(waits):.2f} s, longest {waits[-1]:.2f} s"
-        )
-    print(f"  person: {len(person.pushed)} pushed, at most {max(person.tries)} tries for one")
+def test_housekeeping_by_git_during_demands_loses_nothing(generator: Generator, bare: Path) -> None:
+    stop = threading.Event()
+
+    def tidy_up() -> None:
+        while not stop.is_set():
+            for command in (["pack-refs", "--all"], ["gc", "--quiet"]):
+                subprocess.run(["git", "-C", str(bare), *command], check=False, capture_output=True)
+
+    thread = threading.Thread(target=tidy_up, daemon=True)
+    thread.start()
+    try:
+        rig.book(generator, *map(goal, range(15)))
+    finally:
+        stop.set()
+        thread.join(rig.PATIENCE_S)
+    assert len(rig.operations(bare)) == 15
+    rig.assert_sound(bare, verify_last=5)
+
+
+def test_the_remote_is_never_force_pushed_and_nothing_is_merged(
+    url: str, bare: Path, person: Person
+) -> None:
+    rig.git(bare, "config", "receive.denyNonFastForwards", "true")
+    rig.git(bare, "config", "core.logAllRefUpdates", "always")
+    with rig.running(url) as generator:
+        for number in range(4):
+            if number:
+                person.change({"README.md": f"{number}\n"})
+            rig.book(generator, goal(number))
+    moves = rig.git(bare, "log", "--walk-reflogs", "--format=%H", "main").splitlines()[::-1]
+    for older, newer in pairwise(moves):
+        rig.git(bare, "merge-base", "--is-ancestor", older, newer)
+    assert [commit.one("Operation") for commit in rig.commits(bare)] == ["join", *["", "join"] * 3]
+    rig.assert_sound(bare)
+
+
+# ---- a clone that is behind ----

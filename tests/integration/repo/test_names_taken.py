@@ -11,20 +11,14 @@ import yaml
 from demandops.base import naming
 from demandops.base.naming import Subject, SubjectKind
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import ClaimKey
 from demandops.repo import reader
 from demandops.repo.merge_check import merge_check
 from demandops.repo.write.proposal_branch import branch_name
 
 from tests.kit import rig
-from tests.kit.cli import Run
 from tests.kit.goals import Goal, application, goal, put
 from tests.kit.repo import Person, branches, read
 from tests.kit.rig import Proposed
-
-LONG = "edge/fusion-of-the-long-corridor-in-the-north-"
-PAIR = f"{LONG}4123757", f"{LONG}28067786"
-"""Two ids that were searched for: their releases have one name, with all 48 bits of its digest."""
 
 
 def joining(id: str, node: str = "edge") -> Goal:
@@ -46,52 +40,6 @@ def claims(bare: Path) -> set[str]:
     with reader.opened(str(bare)) as repo:
         ids = {claim.subject.id for claim in repo.snapshot().state.ledger}
         return {id for id in ids if not id.startswith("derived/")}
-
-
-@pytest.mark.parametrize("node", ["edge", "cloud"])
-def test_the_second_of_two_crafted_ids_is_refused_until_the_first_is_released(
-    bare: Path, demandops: Run, node: str
-) -> None:
-    def request(made: Goal) -> tuple[int, str]:
-        ran = demandops("request", "-", "--state-repo", bare, stdin=yaml.safe_dump(made))
-        return ran.code, ran.err
-
-    first, second = joining(PAIR[0]), joining(PAIR[1], node)
-    assert request(first)[0] == 0
-    before = rig.tip(bare)
-    code, told = request(second)
-    assert code and all(id in told for id in PAIR)
-    assert (rig.tip(bare), claims(bare)) == (before, {PAIR[0]})
-    assert request(first | {"shutdown": True})[0] == request(second)[0] == 0
-    assert claims(bare) == {PAIR[1]}
-    rig.assert_sound(bare, verify_last=5)
-
-
-def test_of_two_generators_one_books(bare: Path, tmp_path: Path) -> None:
-    url = bare.as_uri()
-    with rig.running(url) as one, rig.running(url, data=tmp_path / "other") as other:
-        tickets = [one.submit(joining(PAIR[0])), other.submit(joining(PAIR[1], "cloud"))]
-        assert sorted(map(rig.outcome, tickets)) == ["booked", "conflict"]
-    assert len(claims(bare)) == 1
-    rig.assert_sound(bare, verify_last=5)
-
-
-def test_a_claim_by_hand_whose_release_has_the_name_of_another_is_put_back(
-    bare: Path, person: Person
-) -> None:
-    with rig.running(bare) as generator:
-        rig.book(generator, joining(PAIR[0]))
-        (path,) = (each for each in rig.claims(bare) if "/applications/" in each)
-        data = yaml.safe_load(read(bare, path))
-        data["application"] |= {"id": PAIR[1], "node": "cloud"}
-        key = ClaimKey(Subject(SubjectKind.APPLICATION, PAIR[1]), data["demand"])
-        by_hand = {claim_files.path_of(key): yaml.safe_dump(data)}
-        person.write(by_hand)
-        assert "conflict" in {fault.code for fault in merge_check.check(person.folder).faults}
-        person.change(by_hand)
-        rig.book(generator, joining("edge/other"))
-        assert claims(bare) == {PAIR[0], "edge/other"}
-    assert not {*by_hand} & {*rig.claims(bare)}
 
 
 @pytest.mark.usefixtures("short_digests")

@@ -63,36 +63,3 @@ def test_a_hook_learns_of_each_commit(bare: Path, demandops: Run, hook: str, fol
     assert demandops("request", EXPERIMENT[0], "--state-repo", bare).code == 0
     assert "refs/heads/main" in (bare / "told").read_text()
     assert not list(bare.glob("objects/pack/*.keep"))
-
-
-def test_what_people_push_meanwhile_is_carried_out(bare: Path, person: Person) -> None:
-    rig.hook(bare, "post-receive", "true")
-    with rig.running(bare, fetch_interval=30) as generator:  # on this disk, it looks more often
-        rig.book(generator, rig.goal(1))
-        person.policy(approval="required")
-        pushed = tip(bare)
-        rig.wait_until(lambda: str(generator.snapshot.commit) == pushed, "the policy is seen")
-        rig.book(generator, rig.leave(1))
-    rig.assert_sound(bare)
-
-
-def test_demands_wait_while_the_folder_is_away(bare: Path) -> None:
-    rig.hook(bare, "post-receive", "true")
-    with rig.running(bare, fetch_interval=0.1) as generator:
-        with rig.away(bare):
-            ticket = generator.submit(rig.goal(1))
-            rig.wait_until(lambda: generator.remote_status.unreachable, "told")
-            assert not ticket.future.done()
-        assert rig.receipt(ticket).outcome == "booked"
-
-
-def test_a_hook_that_comes_while_a_generator_runs_is_not_passed_by(bare: Path) -> None:
-    with rig.running(bare) as generator:
-        rig.book(generator, rig.goal(1))
-        before = tip(bare)
-        hook = rig.hook(bare, "update", "echo 'ask Ada' >&2; exit 1")
-        ticket = generator.submit(rig.goal(2))
-        rig.wait_until(lambda: "start again" in generator.remote_status.unreachable, "told")
-        assert (tip(bare), ticket.future.done()) == (before, False)
-        hook.unlink()
-        assert rig.receipt(ticket).outcome == "booked"

@@ -16,53 +16,12 @@ from tests.kit.rig import Person, goal
 # ---- away and back ----
 
 
-def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
-    url: str, bare: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    generator = Generator(url)
-    rig.book(generator, goal(0))
-    with rig.away(bare):
-        left = generator.submit(goal(1), "op-1")
-        assert generator.close(timeout=0.3) is False
-        assert rig.outcome(left) == "ShuttingDown"
-        with pytest.raises(StateRepoError, match="cannot be fetched"):
-            Generator(url, start_offline=False)
-        generator = Generator(url)
-        assert "continuing with the commits of the last fetch" in caplog.text
-        fresh = generator.submit(goal(2), "op-2")
-        rig.wait_until(lambda: "trying again" in caplog.text, "the generator tries again")
-        assert not fresh.future.done()
-    rig.receipt(fresh)
-    assert generator.close(rig.PATIENCE_S) is True
-    assert rig.operations(bare)[-2:] == ["op-1", "op-2"]
-    assert rig.books(bare) == rig.books_after(map(goal, range(3)))
-    rig.assert_sound(bare)
-
-
 def test_without_a_clone_a_remote_that_is_away_is_told_at_once(bare: Path) -> None:
     with pytest.raises(StateRepoError, match="cannot be fetched"):
         Generator(bare.with_name("nothing.git").as_uri())
 
 
 # ---- denied ----
-
-
-def test_the_requester_or_the_log_is_told_that_the_remote_cannot_take_a_push(
-    url: str, bare: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """The remote itself, not a hook, refuses the push, as it may do when its disk is full."""
-    with rig.running(url) as generator:
-        rig.git(bare, "config", "receive.maxInputSize", "1")
-        ticket = generator.submit(goal(1))
-        rig.wait_until(lambda: ticket.future.done() or warned(caplog), "the reason is told")
-        rig.git(bare, "config", "--unset", "receive.maxInputSize")
-        rig.book(generator, goal(2))
-        assert ticket.future.done()
-    rig.assert_sound(bare)
-
-
-def warned(caplog: pytest.LogCaptureFixture) -> bool:
-    return any(record.levelname in ("WARNING", "ERROR") for record in caplog.records)
 
 
 def test_a_server_that_cannot_store_a_push_now_is_waited_for(
@@ -128,17 +87,3 @@ def test_a_remote_with_main_checked_out_is_told_instead_of_tried_for_ever(
         ticket = generator.submit(goal(1))
         with pytest.raises(StateRepoError, match="checked out"):
             rig.receipt(ticket)
-
-
-def test_a_stale_lock_at_the_remote_is_told_in_the_log_and_survived(
-    url: str, bare: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """A killed receive-pack left the lock; a warning reports it, and the demand waits."""
-    lock = bare / "refs" / "heads" / "main.lock"
-    with rig.running(url) as generator:
-        lock.touch()
-        ticket = generator.submit(goal(1))
-        rig.wait_until(lambda: warned(caplog), "a warning tells that the push fails")
-        lock.unlink()
-        assert rig.outcome(ticket) == "booked"
-    rig.assert_sound(bare)

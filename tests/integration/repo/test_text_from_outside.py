@@ -1,7 +1,4 @@
-"""Text from outside stays a value: it forges no message and no commit of the generator.
-
-A claim that a person writes is checked like a demand.
-"""
+"""Text from outside stays a value: it forges no message and no commit of the generator."""
 
 from __future__ import annotations
 
@@ -10,12 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
-from demandops.base.naming import Subject, SubjectKind
-from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import ClaimKey
 from demandops.repo import reader
-from demandops.repo.merge_check import merge_check
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
@@ -87,78 +79,18 @@ def test_where_keys_are_listed_an_unsigned_commit_is_a_persons(
     assert made in [value.split()[0] for c in rig.commits(bare) for value in c.all("Caused-By")]
 
 
-# ---- manual claims ----
-
-
-def with_rules(bare: Path, **quotas: int) -> str:
-    data = yaml.safe_load(read(bare, POLICY))
-    for domain in data["domains"]:
-        domain["rules"] = [{"name": "ours", "requesters": ["user*", "station*"]}]
-        domain["quotas"] = quotas
-    return yaml.safe_dump(data)
-
-
-def by_hand(
-    bare: Path, requester: str, app: str = "edge/d1", demand: str = "by-hand"
-) -> dict[str, str | None]:
-    """Return a copy of user1's claim file, for another requester."""
-    path = next(path for path in rig.claims(bare, "user1") if "applications" in path)
-    data = yaml.safe_load(read(bare, path))
-    data |= {"demand": demand, "requesters": [requester]}
-    data["application"]["id"] = app
-    key = ClaimKey(Subject(SubjectKind.APPLICATION, app), demand)
-    return {claim_files.path_of(key): yaml.safe_dump(data)}
-
-
-def held(bare: Path) -> set[tuple[str, ...]]:
-    with reader.opened(str(bare)) as repo:
-        return {claim.requesters for claim in repo.snapshot().state.ledger}
-
-
-@pytest.mark.parametrize(
-    ("requester", "most", "app", "why"),
-    [
-        ("control-room", 10, "edge/d1", "no rule of access domain 'perception' is for"),
-        ("user1", 2, "edge/d1", "'user1' would hold 3 claims"),
-        ("user1\u2060", 10, "edge/d1", "U+2060"),
-        ("user1", 10, "edge-d1", "application 'edge/d1' already publishes this topic"),
-    ],
-)
-def test_a_claim_by_hand_that_a_demand_could_not_book_is_put_back(
-    bare: Path, person: Person, requester: str, most: int, app: str, why: str
-) -> None:
-    demands = [goals.put(f"d{number}", f"user{number}") for number in range(1, 4)]
+def test_ids_of_any_sort_are_kept_by_journal_and_commits(bare: Path) -> None:
+    names = ["d" * 1024, "<a@b> (c), d", "ü" * 200, "a: b", "-rf", "#1", "🚗/🚕", "%s\\n$(x)"]
+    demands = [goals.put(name, name) for name in names]
     with rig.running(bare) as generator:
-        rig.book(generator, *demands[:2])
-        claim = by_hand(bare, requester, app)
-        person.change({POLICY: with_rules(bare, claimsPerRequester=most)})
-        person.write(claim)
-        (fault,) = merge_check.check(person.folder).faults
-        assert why in str(fault)
-        person.change(claim)
-        rig.book(generator, released(demands[1]))
-        assert held(bare) == {("user1",)}
-        told = rig.git(bare, "log", "-1", "--format=%B", "main^")
-        assert next(iter(claim)) in told and why in told
-    assert all(holds for holds, _ in verdicts(bare))
-    with rig.running(bare) as generator:  # the same after a restart
-        rig.book(generator, demands[1])
-        assert held(bare) == {("user1",), ("user2",)}
-
-
-def released(demand: Any) -> Any:
-    return {name: demand[name] for name in ("kind", "demand", "requesters")} | {
-        "operation": "release"
-    }
-
-
-def test_a_claim_by_hand_that_policy_allows_is_followed(bare: Path, person: Person) -> None:
+        rig.book(generator, *demands)
+    made = rig.commits(bare)
+    assert [(commit.one("Demand-Id"), commit.all("Requester")) for commit in made] == [
+        (name, [name]) for name in (n.replace("#1", r'"\x231"') for n in names)
+    ]
+    heads = [{key: one[key] for key in ("kind", "demand", "requesters")} for one in demands]
     with rig.running(bare) as generator:
-        rig.book(generator, goals.put("d1", "user1"))
-        person.change({POLICY: with_rules(bare, claimsPerRequester=3)})
-        person.change(by_hand(bare, "user1"))
-        rig.book(generator, goals.put("d2", "user2"))
-        assert len(rig.claims(bare, "user1")) == 3
-        person.change({POLICY: with_rules(bare, claimsPerRequester=1)})
-        rig.book(generator, released(goals.put("d2", "user2")))
-        assert held(bare) == {("user1",)}, "a booked claim must stay when the policy changes"
+        assert {claim.demand for claim in generator.snapshot.state.ledger} == {*names}
+        rig.book(generator, *(head | {"operation": "release"} for head in heads))
+    assert rig.claims(bare) == []
+    rig.assert_sound(bare, verify_last=3)

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 from demandops.base import strict_yaml
-from demandops.base.errors import InvalidInput
 from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import ClusterDomain, ObjectSelector, Target
@@ -20,14 +19,15 @@ from demandops.cluster.rollouts import RolloutWatcher
 from demandops.cluster.watches import ConfigMapWatch, ObjectCache
 from demandops.decide.decision import decide
 
+from tests.golden.cases import requests_of, start
 from tests.kit import goals
 from tests.kit.clock import Clock
-from tests.kit.cluster import Letters, kube_api
-from tests.kit.golden import requests_of, start
+from tests.kit.cluster import kube_api
 from tests.kit.http import Answer, Call, kubeconfig, serving
 from tests.kit.limits import PATIENCE_S
 from tests.kit.memory import NOW, MemoryRepo
 from tests.kit.rig import wait_until
+from tests.unit.cluster.cases import Letters
 
 OVER = ObjectSelector("Application", "argocd", "demandops-perception")
 CHILDREN = ObjectSelector("Application", "perception")
@@ -219,15 +219,6 @@ def test_data_of_a_deleted_config_map_stay_valid(
         f"{NAME} does not exist yet",
         f"{NAME} is gone; its last data stay valid",
     ]
-
-
-def test_without_a_kubeconfig_the_process_must_be_a_pod(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
-    with pytest.raises(InvalidInput) as refused:
-        ConfigMapWatch("perception", "of-params", print, None)
-    assert str(refused.value).startswith(
-        "without --kubeconfig: needs a pod with a service account's token: "
-    )
 
 
 @pytest.mark.parametrize(

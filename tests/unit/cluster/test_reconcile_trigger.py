@@ -8,7 +8,6 @@ from dataclasses import replace
 from math import inf
 from pathlib import Path
 from threading import Event, Timer
-from time import monotonic
 
 import pytest
 from demandops.base.errors import InvalidInput
@@ -18,10 +17,10 @@ from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import REQUESTED_AT
 from demandops.cluster.reconcile_trigger import ReconcileTrigger, _Wake, signature, web_address
 
+from tests.golden.cases import start
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.cluster import KubeApi, kube_api
-from tests.kit.golden import start
 from tests.kit.http import Answer, Call, Server, kubeconfig, serving
 from tests.kit.limits import PATIENCE_S
 from tests.kit.rig import wait_until
@@ -187,24 +186,6 @@ def test_a_new_kubeconfig_counts_at_the_next_try(
     kubeconfig(tmp_path, api.url)
     wait_until(lambda: api.patches, "the next try")
     waker.close()
-
-
-def test_two_calls_are_a_second_apart() -> None:
-    state, _ = start("experiment")
-    at: list[float] = []
-
-    def answer(call: Call) -> Answer:
-        at.append(monotonic())
-        return Answer()
-
-    with serving(answer) as server:
-        hook = ClusterAccess(receiver=f"{server.url}/hook/abc")
-        waker = ReconcileTrigger({"c-its": hook}, lambda since: ("", None))
-        for number in (1, 2):
-            waker(state.config)
-            wait_until(lambda: len(at) == number, f"call {number}")  # noqa: B023
-        waker.close()
-    assert at[1] - at[0] >= 1
 
 
 def test_an_odd_object_keeps_no_cluster_from_being_woken(api: KubeApi, tmp_path: Path) -> None:

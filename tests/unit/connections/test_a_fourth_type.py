@@ -27,8 +27,7 @@ from demandops.connections.connection import (
     ConnectionType,
 )
 from demandops.decide.decision import Decision
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import keys_of
+from demandops.decide.planning.planner import keys_of, plan
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.ledger import claim as claim_files
 from demandops.templating import engine
@@ -45,7 +44,7 @@ RELAY_TEMPLATES = Path(__file__).parent / "relay"
 class RelayType(ConnectionType):
     """A connection type with one client at the target, for the topics of all its connections."""
 
-    name = "RELAY"
+    name, word = "RELAY", "relay"
     number = 7
     image = "relay"
     options = frozenset({"queue"})
@@ -131,17 +130,6 @@ def test_a_demand_for_it_becomes_a_claim_and_a_client(kind: str) -> None:
     assert yaml.safe_load(config["data"]["relay.yaml"]) == {"fetch": {"/a": "/b"}}
     (release,) = decision.releases
     assert (release.change, release.what) == ("start", "relay on edge")
-
-
-def test_a_further_connection_changes_the_shared_client_by_the_facts_that_it_adds() -> None:
-    world, _ = booked()
-    other = demand("relay", {"/c": "/c"}, id="d", source="vehicle01")
-    (release,) = world.send(routes(other)).releases
-    assert (release.name, release.change) == ("relay-edge", "change")
-    assert release.details == ("+ fetches /c as /c",)
-    world.send(routes(other | {"shutdown": True}))
-    world.send(routes(demand("relay") | {"shutdown": True}))
-    assert world.objects("Deployment") == {}
 
 
 def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:

@@ -223,15 +223,6 @@ def test_derived_connections_count_before_they_are_booked() -> None:
     assert books.send(demand([app(0, 60, node="edge", connect="none")])).outcome == "booked"
 
 
-def test_a_claim_that_is_too_large_for_its_file_is_refused_before_a_release_is_planned() -> None:
-    some, more = demand([], [link(0, topics=400)]), demand([], [link(0, topics=800)])
-    limited = repo(fileBytes=20_000)
-    some_calls, _, answer = work_of(limited, some)
-    assert codes(answer) == {"too-large"}
-    calls, _, _ = work_of(limited, more)
-    assert calls < 2.5 * some_calls
-
-
 @pytest.mark.parametrize(
     "made",
     [

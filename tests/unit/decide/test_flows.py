@@ -17,8 +17,7 @@ import yaml
 from demandops.base.errors import Refused
 from demandops.decide.edits import changed_claim_files
 from demandops.decide.placement.relocation import following_overrides
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
+from demandops.decide.planning.planner import ReleaseKey, affected_keys, all_keys, plan
 from demandops.decide.state import rendered_files
 from demandops.decide.warnings import policy_warnings
 from demandops.model.config.config import Config
@@ -53,11 +52,8 @@ class Origin(NamedTuple):
 class Graphs:
     """Random definitions of two types of applications, whose services read each other."""
 
-    def __init__(
-        self, random: Random, place: Mapping[str, Any] | None = None, *, each: bool = False
-    ) -> None:
-        """Add ``place`` to services for an application and, if ``each``, to some for a topic."""
-        self.random, self._place, self._places_each = random, dict(place or {}), each
+    def __init__(self, random: Random) -> None:
+        self.random = random
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
         self.files: dict[str, str | None] = {**brokers("edge")}
         roles = [Origin(role, frozenset({role}), "source") for role in ROLES]
@@ -134,17 +130,15 @@ class Graphs:
         service = self._service(name, type)
         if self.random.random() < 0.5:
             read = self._chosen(self._origins[type], least=1)
-            placed = self._place and self.random.random() < 0.8
             self._add(type, name, "application", False, read)
         else:
             at_source = self.random.random() < 0.5
             first = self._first(self._origins[type], type, at_source)
             read = [first, *self._chosen(self._readable(type, "topic", at_source, first), least=0)]
             service |= {"each": "in0", "placement": "source" if at_source else "application"}
-            placed = self._places_each and not at_source and self.random.random() < 0.5
             self._add(type, name, "topic", at_source, read)
         service["inputs"] = {f"in{n}": one.name for n, one in enumerate(read)}
-        return service | (copy.deepcopy(self._place) if placed else {})
+        return service
 
     def _share(self, name: str) -> dict[str, dict[str, str]]:
         """Define a service for both types; return, by type, what the service reads."""
@@ -152,7 +146,6 @@ class Graphs:
         at_source = scope in ("topic", "node") and self.random.random() < 0.5
         definition = self._service(name, name) | {"scope": scope, "name": name}
         definition |= {"nodes": {"c-its": CLUSTER_NODE}} if scope == "cluster" else {}
-        definition |= copy.deepcopy(self._place) if scope == "application" else {}
         definition |= {"placement": "source" if at_source else "application"}
         first = self._first(self._common, TYPES[0], at_source or scope == "cluster")
         count = self.random.randint(0, 1)
@@ -246,7 +239,7 @@ def delivered(
     for app in (app for apps in demands.held.values() for app in apps):
         booked = repo.state.ledger.application(app["id"])
         assert booked is not None
-        wanted = {*instances(demands.graphs, app, {**booked.services, **booked.moved})}
+        wanted = {*instances(demands.graphs, app, booked.moved)}
         for delivery in app["deliver"]:
             name = delivery["output"].partition(".")[0]
             for one in services:

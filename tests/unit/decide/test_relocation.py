@@ -1,157 +1,18 @@
-"""What is placed fits its node, stays there, and leaves a drained node with all that it reads."""
+"""A drain spreads what it moves, and moves the same in parts; ``tests/scenarios`` has its rules."""
 
 from __future__ import annotations
 
-import copy
-from collections import Counter
-from collections.abc import Mapping
 from dataclasses import replace
-from random import Random
-from typing import Any
 
-import pytest
-from demandops.base.errors import Refused
 from demandops.decide.booking import Drain
 from demandops.decide.placement.relocation import with_moves
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import all_keys
-from demandops.model.config.config import Config
-from demandops.model.demand.demand import Application, Requirement
-from demandops.model.release import ServiceRelease
-from hypothesis import given
-from hypothesis import strategies as st
+from demandops.model.demand.demand import Requirement
 
-from tests.kit.chance import chances, examples
 from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo, rebuilt
-from tests.unit.decide.test_flows import NODES, Demands, Graphs, assert_follows
 
-MOST = 2
-PLACE = {"place": {"capabilities": ["gpu"]}, "requests": {"slot": 1}}
-
-
-class NamingServices(Demands):
-    """Demands that name the nodes of some services."""
-
-    def _application(self, id: str) -> dict[str, Any]:
-        app = super()._application(id)
-        services = self.graphs.services[app["type"]].items()
-        names = [name for name, one in services if one["scope"] == "application"]
-        chosen = self.random.sample(names, self.random.randint(0, min(1, len(names))))
-        return app | {"services": {name: self.random.choice(NODES) for name in chosen}}
-
-
-class Placed(Demands):
-    """Demands whose applications name no node, but have a ``place``."""
-
-    def next(self) -> dict[str, Any]:
-        goal = super().next()
-        apps = [
-            {key: value for key, value in app.items() if key != "node"} | {"place": PLACE["place"]}
-            for app in goal.get("applications", ())
-        ]
-        return goal | ({"applications": apps} if apps else {})
-
-    def note_nodes(self, repo: MemoryRepo) -> None:
-        for app in (app for apps in self.held.values() for app in apps):
-            app["node"] = applications(repo)[app["id"]].node
-
-
-def with_gpus(config: Config, random: Random, drained: str = "") -> Config:
-    """Return the configuration with GPUs on some nodes, which are in random order."""
-    nodes = [
-        node.model_copy(
-            update={
-                "capabilities": ("gpu",) * (id in NODES),
-                "capacity": {"slot": str(MOST)} if id in NODES else None,
-                "drained": id == drained,
-            }
-        )
-        for id, node in config.nodes.items()
-    ]
-    random.shuffle(nodes)
-    return replace(config, nodes={node.id: node for node in nodes})
-
-
-def configure(repo: MemoryRepo, config: Config) -> None:
-    repo.state = state_of(config, repo.state.ledger)
-
-
-def applications(repo: MemoryRepo) -> dict[str, Application]:
-    return {one.subject.id: one.application for one in repo.state.ledger if one.is_on_application}
-
-
-def places(repo: MemoryRepo) -> dict[str, Mapping[str, str]]:
-    """Return the chosen nodes of each application: of its services and, under "", its own."""
-    return {
-        id: {**app.services} | ({"": app.node} if app.place else {})
-        for id, app in applications(repo).items()
-    }
-
-
-def assert_sound(repo: MemoryRepo, demands: Demands) -> None:
-    apps = [app for apps in demands.held.values() for app in apps]
-    placed = places(repo)
-    for app in apps:
-        for name, definition in repo.config.services[app["type"]].items():
-            assert name in placed[app["id"]] or not definition.place
-        for name, node in app.get("services", {}).items():
-            assert placed[app["id"]].get(name, app["node"]) == node
-    releases = (plan(repo.state, key) for key in all_keys(repo.state))
-    used = Counter(
-        one.node.id for one in releases if isinstance(one, ServiceRelease) and one.service.requests
-    )
-    assert all(used[node] <= MOST for node in used), used
-    assert {*used} <= {*NODES}
-    assert_follows(repo, demands, placed)
-
-
-@pytest.mark.parametrize("kind", [Demands, NamingServices, Placed])
-@examples(5)
-@given(chances, st.integers(1, 6))
-def test_what_is_placed_fits_stays_and_leaves_drained_nodes(
-    kind: type[Demands], random: Random, length: int
-) -> None:
-    graphs = Graphs(random, None if kind is Placed else PLACE, each=kind is NamingServices)
-    demands, repo = kind(random, graphs), MemoryRepo(graphs.files)
-    plain = repo.config
-    for _ in range(length):
-        configure(repo, with_gpus(plain, random))
-        held, before = copy.deepcopy((demands.held, demands.where)), places(repo)
-        goal = demands.next()
-        twin = repo.copy()
-        configure(twin, with_gpus(plain, random))
-        taken, same = repo.take(goal), twin.take(goal)
-        assert twin.files == repo.files, "another generator must decide the same"
-        if isinstance(taken, Refused):
-            assert kind is not Placed and str(same) == str(taken)
-            assert {fault.code for fault in taken.faults} <= {"no-room", "capacity", "conflict"}
-            demands.held, demands.where = held
-        alone = {app["id"] for app in goal.get("applications", ())} - demands.others(goal)
-        for id, nodes in places(repo).items():
-            named = id in alone and kind is NamingServices
-            assert named or nodes == before.get(id, nodes), "a demand must not move what runs"
-        if isinstance(demands, Placed):
-            demands.note_nodes(repo)
-        assert_sound(repo, demands)
-        node = random.choice(NODES)
-        configure(repo, with_gpus(plain, random, node))
-        left, claims = places(repo), list(repo.state.ledger)
-        decision = repo.send(Drain(id=node))
-        for id, nodes in places(repo).items():
-            for name, now in nodes.items():
-                told = f"service '{name}' of application '{id}'" if name else f"application '{id}'"
-                moved = any(told in text for text in decision.placed)
-                stays = any(told in text for text in decision.warnings)
-                assert (now != left[id][name]) is moved
-                assert (left[id][name] == node) is (moved or stays)
-        for claim in (one for one in claims if one.is_on_application):
-            moved_claim = repo.state.ledger.get(claim.key)
-            assert moved_claim and replace(claim, held=moved_claim.held) == moved_claim
-        if isinstance(demands, Placed):
-            assert not decision.warnings
-            demands.note_nodes(repo)
-        assert_sound(repo, demands)
+FREE = ("edge", "vehicle01")
+"""The nodes with a GPU, beside the drained node ``cloud``."""
 
 
 def on_cloud(count: int, *stuck: int) -> MemoryRepo:
@@ -173,13 +34,20 @@ def on_cloud(count: int, *stuck: int) -> MemoryRepo:
         else replace(one, held=replace(one.application, place=gpu))
         for one in repo.state.ledger
     )
-    repo.state = state_of(with_gpus(repo.config, Random(0), "cloud"), ledger)
+    nodes = {
+        id: node.model_copy(
+            update={"capabilities": ("gpu",) * (id in FREE), "drained": id == "cloud"}
+        )
+        for id, node in repo.config.nodes.items()
+    }
+    repo.state = state_of(replace(repo.config, nodes=nodes), ledger)
     return repo
 
 
 def test_what_leaves_a_node_is_spread_over_the_others() -> None:
-    moved = on_cloud(4).decide(Drain(id="cloud")).state.ledger
-    assert dict(moved.applications_on) == {"edge": 2, "vehicle01": 2}
+    decision = on_cloud(4).decide(Drain(id="cloud"))
+    assert len(decision.placed) == 4
+    assert dict(decision.state.ledger.applications_on) == dict.fromkeys(FREE, 2)
 
 
 def test_a_drain_in_parts_moves_the_same_applications_and_skips_none() -> None:

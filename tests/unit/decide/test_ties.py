@@ -16,6 +16,7 @@ from demandops.templating.charts import merged, overridden
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.config import patches_commute
 from tests.kit.memory import MemoryRepo
@@ -63,28 +64,11 @@ def test_a_merge_patch_is_that_of_rfc_7386(target: Any, patch: Any) -> None:
             assert result[key] == patch[key]
 
 
-DEFAULTS = {"limits": {"cpu": 1, "memory": 2}, "env": {}}
+TABLES = plain_yaml.beside(__file__)
+DEFAULTS = TABLES["defaults"]
 
 
-@pytest.mark.parametrize(
-    ("values", "patches", "result", "in_helm"),
-    [
-        ({}, [{"limits": None}], {"limits": None}, {"env": {}}),
-        ({"limits": {"cpu": 3}}, [{"limits": None}], {"limits": None}, {"env": {}}),
-        ({}, [{"limits": {"cpu": None}}], {"limits": {"cpu": None}}, {"limits": {"memory": 2}}),
-        # a null that no default meets would reach the chart's templates, and fail its schema
-        (
-            {"env": {"A": "1", "B": "2"}, "x": 1},
-            [{"env": {"A": None}, "x": None}],
-            {"env": {"B": "2"}},
-            None,
-        ),
-        ({}, [{"limits": None}, {"limits": {"gpu": 1}}], None, {"limits": {"gpu": 1}, "env": {}}),
-        ({}, [{"limits": {"gpu": 1}}, {"limits": None}], {"limits": None}, {"env": {}}),
-        ({}, [{"limits": None}, {"limits": {"cpu": 4}}], None, {"limits": {"cpu": 4}, "env": {}}),
-        ({}, [{"env": {"A": "1"}}, {"env": {"A": None}}], {"env": {}}, DEFAULTS),
-    ],
-)
+@pytest.mark.parametrize(("values", "patches", "result", "in_helm"), TABLES["nulls"])
 def test_null_removes_what_the_template_wrote_and_what_the_chart_has(
     values: dict[str, Any], patches: list[dict[str, Any]], result: Any, in_helm: Any
 ) -> None:
@@ -131,20 +115,7 @@ def test_a_tie_is_told_where_the_order_of_names_decides(
         assert {(each.file, each.field) for each in told} == {("overrides/other.yaml", "priority")}
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "tied"),
-    [
-        ({"replicas": 1}, {"replicas": 2}, True),
-        ({"replicas": 1}, {"replicas": 1}, False),
-        ({"replicas": 1}, {"replicas": 2, "priority": 1}, False),
-        ({"replicas": 1}, {"node": "cloud"}, False),
-        ({"values": {"k": 1}}, {"values": {"k": True}}, True),
-        ({"values": {"k": {"a": 1}}}, {"values": {"k": {"b": 1}}}, False),
-        ({"hold": True}, {"replicas": 2}, True),
-        ({"hold": True}, {"hold": True}, False),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("one", "other", "tied"), TABLES["tied"], ids=str)
 def test_overrides_are_tied_if_they_differ_in_what_both_set(
     one: dict[str, Any], other: dict[str, Any], tied: bool
 ) -> None:

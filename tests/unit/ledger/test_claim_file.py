@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from random import Random
 
 import pytest
-from demandops.base.errors import Fault, InvalidInput
+from demandops.base.errors import InvalidInput
 from demandops.base.naming import Subject, SubjectKind, id_problem
 from demandops.connections.connection import Connection, Route, merged_routes
 from demandops.connections.connection_types import CONNECTION_TYPES
-from demandops.connections.mqtt import MQTT
-from demandops.model.config.base_model import time_text
 from demandops.model.demand.demand import (
     LONGEST_S,
     Application,
     Delivery,
     InputTopic,
     Lease,
-    Requirement,
 )
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import Claim, ClaimKey, demand_id
+from demandops.model.ledger.claim import Claim, ClaimKey
 from demandops.model.ledger.ledger import Ledger
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit import plain_yaml
 from tests.kit.chance import chances, examples, visible
 from tests.kit.memory import rebuilt
 
@@ -41,7 +38,7 @@ ids = st.one_of(st.sampled_from(TRICKY), st.text(visible, min_size=1, max_size=2
 topics = st.from_regex(r"(/[a-zA-Z_][a-zA-Z0-9_]{0,6}){1,3}", fullmatch=True)
 zones = [timezone(timedelta(hours=hours, minutes=45)) for hours in (-11, 5)]
 moments = st.datetimes(
-    datetime(2000, 1, 1),
+    datetime(1, 1, 3),
     datetime(2100, 1, 1),
     timezones=st.sampled_from([timezone.utc, *zones]),
 )
@@ -161,143 +158,24 @@ def test_a_ledger_is_the_same_in_whatever_order_it_was_built(
     assert everything(ledger) == everything(Ledger())
 
 
-AT = datetime(2026, 1, 31, tzinfo=timezone.utc)
-LINK = Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"), Route("/c", "/d")))
+CASES = plain_yaml.beside(__file__)
 
 
-def edited(claim: Claim, *changes: tuple[str, str]) -> Claim:
-    """Write a claim's file, replace texts in it as a person may, and return the claim it has."""
-    text = claim_files.text_of(claim)
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    return claim_files.read(text, claim_files.path_of(claim.key))
+@pytest.mark.parametrize("case", CASES["older"])
+def test_a_claim_of_an_older_schema_is_read_as_the_present_one(case: dict[str, str]) -> None:
+    claims = [claim_files.read(case[schema], case["path"]) for schema in ("written", "now")]
+    assert claims[0] == claims[1]
 
 
-def fault_of(claim: Claim, *changes: tuple[str, str]) -> Fault:
+@pytest.mark.parametrize("case", CASES["refused"], ids=lambda case: case["says"])
+def test_a_claim_that_a_person_edited_is_read_strictly(case: dict[str, str]) -> None:
+    assert case["old"] in CASES["edited"]
     with pytest.raises(InvalidInput) as invalid:
-        edited(claim, *changes)
+        claim_files.read(CASES["edited"].replace(case["old"], case["new"]), CASES["path"])
     (found,) = invalid.value.faults
-    assert found.file == claim_files.path_of(claim.key)
-    return found
-
-
-OF_A_CONNECTION = """apiVersion: demandops.ledger/{version}
-kind: ConnectionClaim
-connection: a
-demand: {demand}
-request: r
-requesters:
-- c
-- e
-booked: "2026-01-31T00:00:00.000000Z"
-type: mqtt
-source: d
-target: e
-topics:
-  /a:
-    target: /b
-    requesters:
-    - e
-  /c: /d
-"""
-OF_AN_APPLICATION = """apiVersion: demandops.ledger/v2
-kind: ApplicationClaim
-application: a
-demand: d
-request: r
-requesters:
-- c
-- e
-booked: "2026-01-31T00:00:00.000000Z"
-action: DeploymentRequest
-definition: object-detection-fusion
-node: edge
-inputs:
-  point_cloud:
-  - topic: /a
-    source: v
-    requesters:
-    - e
-  - topic: /b
-    source: v
-place:
-  labels:
-    zone: north
-"""
-
-
-@pytest.mark.parametrize(
-    ("demand", "version", "joined"),
-    [(demand_id("r", "ce"), "v1", True), ("d", "v1", False), (demand_id("r", "ce"), "v2", False)],
-)
-def test_a_claim_on_a_connection_of_an_older_schema_is_read(
-    demand: str, version: str, joined: bool
-) -> None:
-    claim = Claim(LINK, demand, "r", ("c", "e"), AT, joined=joined)
-    text = OF_A_CONNECTION.format(version=version, demand=demand)
-    assert claim_files.read(text, claim_files.path_of(claim.key)) == claim
-
-
-def test_a_claim_on_an_application_of_an_older_schema_is_read() -> None:
-    inputs = {"point_cloud": (InputTopic("/a", "v"), InputTopic("/b", "v"))}
-    place = Requirement(labels=("zone=north",))
-    held = Application("a", "object-detection-fusion", "edge", inputs, place=place)
-    claim = Claim(held, "d", "r", ("c", "e"), AT, joined=True)
-    assert claim_files.read(OF_AN_APPLICATION, claim_files.path_of(claim.key)) == claim
-
-
-@pytest.mark.parametrize(
-    ("written", "edit", "problem"),
-    [
-        ("booked", "0001-01-01T00:00:00+23:59", "is a time that does not exist"),
-        ("booked", "2026-01-31", "is not a time with a time zone"),
-        ("until", "9999-12-31T23:59:59Z", "is after the year 8999"),
-    ],
-)
-def test_a_time_that_cannot_be_reckoned_with_is_refused(
-    written: str, edit: str, problem: str
-) -> None:
-    times = {"booked": AT, "until": AT.replace(day=30)}
-    claim = Claim(LINK, "d", "r", ("c",), AT, Lease(1, LONGEST_S, times["until"]))
-    found = fault_of(claim, (time_text(times[written]), edit))
-    assert problem in found.message
-
-
-def test_a_claim_of_any_year_survives_its_file() -> None:
-    claim = Claim(LINK, "d", "r", ("c",), AT.replace(year=7))
-    assert edited(claim) == claim
+    assert (found.file, found.field) == (CASES["path"], case["field"])
+    assert case["says"] in found.message
 
 
 def test_half_a_character_in_a_forged_trailer_has_a_path_segment() -> None:
     assert claim_files.segment("\ud800") != claim_files.segment("\ud801")
-
-
-def test_topics_stay_readable() -> None:
-    topics = (Route("/a", "/b"), Route("/b", "/c", qos=1, rate=0.5))
-    text = claim_files.text_of(Claim(replace(LINK, topics=topics), "d", "r", ("v",), AT))
-    assert text.endswith(
-        "topics:\n  - source: /a\n    target: /b\n"
-        "  - source: /b\n    target: /c\n    qos: 1\n    rate: 0.5\n"
-    )
-
-
-@pytest.mark.parametrize(
-    ("written", "field", "problem"),
-    [
-        ("{source: /a, qso: 1}", ".qso", "is not a field here"),
-        ("{source: /a, qos: 7}", ".qos", "input should be less than or equal to 2"),
-        ("{source: /a, qos: true}", ".qos", "must be a whole number"),
-        ("{source: /a, reverse: 1}", ".reverse", "must be true or false, not 1"),
-        ("[/b]", "", "must be a mapping, not ['/b']"),
-    ],
-)
-def test_routes_are_read_strictly(written: str, field: str, problem: str) -> None:
-    found = fault_of(Claim(LINK, "d", "r", ("c",), AT), ("source: /a\n    target: /b", written))
-    assert found.field == f"connection.topics[0]{field}"
-    assert found.message.startswith(problem)
-
-
-def test_a_claim_of_a_type_that_is_open_is_not_read() -> None:
-    claim = Claim(LINK, "d", "r", ("c",), AT)
-    assert fault_of(claim, ("type: mqtt", "type: auto")).field == "connection"

@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 from demandops.base.errors import Fault, InvalidInput, Refused
+from demandops.cli.authoring.schema import SCHEMAS
 from demandops.decide.state import State
 
 from tests.kit import plain_yaml
 from tests.kit.connections import decided, demand, routes
 from tests.kit.connections import state as with_nodes
-from tests.kit.forms import CONFIG_MODELS, GOAL_MODELS
 from tests.kit.goals import perception
 from tests.kit.memory import MemoryRepo
 from tests.scenarios.running import configuration
@@ -107,7 +107,7 @@ def _messages(cases: Iterable[tuple[str, Iterable[Fault]]]) -> Iterator[str]:
 
 def _fields() -> Iterator[str]:
     """Yield each field of each file and goal with the field's JSON schema."""
-    for model in (*CONFIG_MODELS.values(), *GOAL_MODELS):
+    for model, _ in SCHEMAS.values():
         schema = model.model_json_schema()
         for part in (schema, *schema.get("$defs", {}).values()):
             if part.get("additionalProperties", True) is False:

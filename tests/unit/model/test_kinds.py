@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import yaml
 from demandops.model.config.load import load
-from demandops.model.config.policy import KINDS, AccessDomain
 
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
@@ -95,8 +94,3 @@ def test_the_list_of_the_documentation_is_taken() -> None:
     files = edited(DOMAINS, '    nodes: ["*"]\n', f'    nodes: ["*"]\n{listed[0]}')
     assert ("monitoring.coreos.com", "ServiceMonitor") in permitted(files)
     assert len(permitted(files)) == 4
-
-
-def test_the_schema_takes_a_word_or_a_kind() -> None:
-    items = AccessDomain.model_json_schema()["properties"]["kinds"]["anyOf"][0]["items"]
-    assert items["anyOf"][0]["enum"] == list(KINDS)

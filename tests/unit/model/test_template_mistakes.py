@@ -50,17 +50,9 @@ def test_a_mistake_is_told_with_template_and_line(word: str, text: str) -> None:
     assert found.endswith("; fix the template")
 
 
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [
-        (f"{{% include '{TEMPLATE}' %}}\n", "recursion"),
-        (f"{{% extends '{TEMPLATE}' %}}\n", "recursion"),
-        (f"{{% import '{TEMPLATE}' as x %}}\n", "'replicas' is undefined"),
-        ("x: {{ 'a' * 1000001 }}\n", "at most 1000000 are allowed"),
-    ],
-)
+@pytest.mark.parametrize(("text", "word"), LISTED["without end"])
 def test_a_template_without_end_is_told(text: str, word: str) -> None:
-    (found, *_) = appended(text)
+    (found, *_) = appended(text.replace("ITSELF", f"'{TEMPLATE}'"))
     assert found.startswith(f"{TEMPLATE}:")
     assert word in found
 
@@ -83,51 +75,34 @@ def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
         assert not found.startswith(f"{TEMPLATE}:{LAST}: {name}; ")
 
 
-class TestValues:
-    """The result of a template is parsed, and checked against the chart's schema."""
+def test_every_value_that_does_not_fit_the_charts_schema_is_told() -> None:
+    text = skeleton()[TEMPLATE].replace("replicas: {{ replicas }}", "replicas: many")
+    found = refused({TEMPLATE: text.replace("{{ node.host_network }}", "maybe")})
+    assert all(one.startswith(f"{TEMPLATE}:") for one in found)
+    assert all(one.endswith(f"; fix the template or {CHART}") for one in found)
+    places = sorted(one.split(": ")[1] for one in found)
+    assert places == ["values.hostNetwork", "values.replicas"]
 
-    def test_every_value_that_does_not_fit(self) -> None:
-        text = skeleton()[TEMPLATE].replace("replicas: {{ replicas }}", "replicas: many")
-        text = text.replace("hostNetwork: {{ node.host_network }}", "hostNetwork: maybe")
-        found = refused({TEMPLATE: text})
-        assert all(one.startswith(f"{TEMPLATE}:") for one in found)
-        assert all(one.endswith(f"; fix the template or {CHART}") for one in found)
-        places = sorted(one.split(": ")[1] for one in found)
-        assert places == ["values.hostNetwork", "values.replicas"]
 
-    @pytest.mark.parametrize(
-        ("text", "line", "word"),
-        [
-            ("null", LAST - 4, 'values.detection: "pointCloudTopic"'),
-            # the quotes are part of the text that is glued to the topic
-            (
-                "/prefix{{ source_topic }}",
-                LAST - 2,
-                r'values.detection.pointCloudTopic: "/prefix\"',
-            ),
-            ('"{{ source_topic }}"', LAST - 2, " of the rendered text: not valid YAML: "),
-        ],
-    )
-    def test_a_topic_that_the_schema_or_yaml_does_not_take(
-        self, text: str, line: int, word: str
-    ) -> None:
-        template = skeleton()[TEMPLATE].replace("{{ source_topic }}", text)
-        (found,) = refused({TEMPLATE: template})
-        assert found.startswith(f"{TEMPLATE}:{line}: ")
-        assert word in found
+@pytest.mark.parametrize(("text", "above", "word"), LISTED["topics"])
+def test_a_topic_that_the_schema_or_yaml_does_not_take(text: str, above: int, word: str) -> None:
+    (found,) = refused({TEMPLATE: skeleton()[TEMPLATE].replace("{{ source_topic }}", text)})
+    assert found.startswith(f"{TEMPLATE}:{LAST - above}: ")
+    assert word in found
 
-    @pytest.mark.parametrize("text", ["", "- a\n", "true\n", "{# nothing #}", "~\n"])
-    def test_no_mapping(self, text: str) -> None:
+
+def test_a_template_must_give_a_mapping() -> None:
+    for text in ("", "- a\n", "true\n", "{# nothing #}", "~\n"):
         assert refused({TEMPLATE: text}) == [f"{TEMPLATE}: must give a mapping of Helm values"]
 
-    @pytest.mark.parametrize("end", ["\\n", "\\n\\n", "\\n\\n\\n", "", " \\n"])
-    def test_a_text_of_several_lines_stays_as_it_is(self, end: str) -> None:
-        more = f'podAnnotations: {{a: "x\\ny{end}"}}\n'
-        books = MemoryRepo({TEMPLATE: skeleton()[TEMPLATE] + more})
-        books.send(perception())
-        release = books.objects("HelmRelease")["od-edge-vehicle00"]
-        text = f"x\\ny{end}".replace("\\n", "\n")
-        assert release["spec"]["values"]["podAnnotations"] == {"a": text}
+
+@pytest.mark.parametrize("end", ["\\n", "\\n\\n\\n", "", " \\n"])
+def test_a_text_of_several_lines_stays_as_it_is(end: str) -> None:
+    books = MemoryRepo({TEMPLATE: skeleton()[TEMPLATE] + f'podAnnotations: {{a: "x\\ny{end}"}}\n'})
+    books.send(perception())
+    release = books.objects("HelmRelease")["od-edge-vehicle00"]
+    text = f"x\\ny{end}".replace("\\n", "\n")
+    assert release["spec"]["values"]["podAnnotations"] == {"a": text}
 
 
 @pytest.mark.parametrize(

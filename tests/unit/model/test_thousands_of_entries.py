@@ -6,7 +6,6 @@ Work is counted in calls of functions, so the tests need no clock.
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,10 @@ from demandops.base.errors import Fault, InvalidInput
 from demandops.model.config.load import load
 
 from tests.kit import plain_yaml
-from tests.kit.config import (
-    configuration,
-    override,
-)
+from tests.kit.config import configuration, override
+from tests.unit.decide.test_budget import counted
 
 Files = dict[str, str]
-CONFIG = load(configuration())
-
-
 MANY = plain_yaml.load(Path(__file__).with_name("many-entries.yaml").read_text())
 
 
@@ -53,21 +47,13 @@ def numbered(entry: Any, number: int) -> Any:
 
 
 def work_of(files: Files) -> tuple[int, tuple[Fault, ...]]:
-    calls = 0
-
-    def count(*_: object) -> None:
-        nonlocal calls
-        calls += 1
-
-    whole = configuration(files)
-    sys.setprofile(count)
-    try:
-        load(whole)
-    except InvalidInput as invalid:
-        return calls, invalid.faults
-    finally:
-        sys.setprofile(None)
-    return calls, ()
+    calls, whole = [0], configuration(files)
+    with counted(calls):
+        try:
+            load(whole)
+        except InvalidInput as invalid:
+            return calls[0], invalid.faults
+    return calls[0], ()
 
 
 @pytest.mark.parametrize("kind", MANY)

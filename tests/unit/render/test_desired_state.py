@@ -10,8 +10,8 @@ import pytest
 import yaml
 from demandops.repo.merge_check.rendered_charts import manifest_faults
 
+from tests.golden.cases import CASES, rendered
 from tests.kit.goals import application, connection, goal, perception
-from tests.kit.golden import CASES, rendered
 from tests.kit.memory import MemoryRepo
 from tests.kit.plain_yaml import FAST
 

@@ -20,6 +20,7 @@ from demandops.model.config.load import load
 from demandops.render.gitops import expression_of, node_rule
 from demandops.repo.merge_check.rendered_charts import manifest_faults
 
+from tests.kit import plain_yaml
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
 
@@ -28,18 +29,8 @@ BOOTSTRAP = "bootstrap/c-its.yaml"
 ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs" / "policy.md").read_text()
 EXAMPLE = ROOT / "examples" / "policy" / "sensors-apart.yaml"
-HEAD = "apiVersion: demandops/v1\nkind: {}\n"
-POLICY = f"""{HEAD.format("AccessDomains")}domains:
-  - {{name: fleet, namespace: ns-fleet, nodes: ["vehicle*", "car.[?]", own*]}}
-  - {{name: city, namespace: ns-city, nodes: [edge, cloud, station00], ros: {{domainId: 7}}}}
-"""
-OWN = f"""{HEAD.format("Nodes")}nodes:
-  - {{id: "car.[1]", type: vehicle, cluster: c-its, selector: {{kubernetes.io/hostname: a}}}}
-  - {{id: own1, type: vehicle, cluster: c-its, selector: {{kubernetes.io/hostname: b}}}}
-  - {{id: own2, type: vehicle, cluster: c-its, selector: {{place: "x", rack: "1"}}}}
-  - {{id: own3, type: vehicle, cluster: c-its, accessDomains: [{{name: city}}]}}
-"""
-FILES = {DOMAINS: POLICY, "inventory/nodes/own.yaml": OWN}
+TEXTS = plain_yaml.beside(__file__)
+FILES = {DOMAINS: TEXTS["policy"], "inventory/nodes/own.yaml": TEXTS["nodes"]}
 
 
 def taken(rule: str, selector: Mapping[str, str]) -> bool:
@@ -89,8 +80,8 @@ def bootstrap(files: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     return {item["kind"]: item for item in yaml.safe_load_all(text)}
 
 
-NODE = f"{HEAD.format('Nodes')}nodes: [{{id: vehicle9, type: vehicle, cluster: c-its}}]\n"
-OWN_LABELS = NODE.replace("c-its}", "c-its, selector: {node_id: nine}}")
+OWN_LABELS = TEXTS["node"].replace("c-its}", "c-its, selector: {node_id: nine}}")
+NEW_NODE = "inventory/nodes/new.yaml"
 CHARTS, NEW = "registry/charts.yaml", "appdefs/new/charts/new"
 CHART = {
     CHARTS: f"{skeleton()[CHARTS]}  new: {{folder: {NEW}, version: 1.0.0}}\n",
@@ -101,8 +92,9 @@ CHART = {
 @pytest.mark.parametrize(
     ("gitops", "added", "changed"),
     [
-        *((gitops, {"inventory/nodes/new.yaml": NODE}, set()) for gitops in ("flux", "argocd")),
-        ("flux", {"inventory/nodes/new.yaml": OWN_LABELS}, {"c-its.yaml"}),
+        ("flux", {NEW_NODE: TEXTS["node"]}, set()),
+        ("argocd", {NEW_NODE: TEXTS["node"]}, set()),
+        ("flux", {NEW_NODE: OWN_LABELS}, {"c-its.yaml"}),
         ("flux", CHART, {"new-1.0.0.yaml"}),
     ],
     ids=["a vehicle", "a vehicle, by Argo CD", "labels of its own", "a chart in a new folder"],

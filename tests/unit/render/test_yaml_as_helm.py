@@ -120,9 +120,3 @@ def test_a_list_counts_as_a_level(depth: int) -> None:
     assert_read_as_by_pyyaml(
         f"{opened}{' ' * depth}b: {strict_yaml.to_json(['/v1/points'] * 40)}\n"
     )
-
-
-def test_long_texts_stay_refused() -> None:
-    text = f"a: {strict_yaml.to_json(['/v1/points'] * 40)}\n" + "#" * strict_yaml.MAX_LENGTH
-    with pytest.raises(InvalidInput, match="characters; at most"):
-        strict_yaml.load(text)

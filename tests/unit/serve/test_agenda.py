@@ -181,44 +181,23 @@ def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) ->
     assert remote.push_denied == ""
 
 
-class Sending:
-    """Sends demands to a rate limit of two a minute."""
+def test_a_rate_limit_counts_a_hand_in_once_and_forgets_who_sends_no_more() -> None:
+    quotas = "    quotas: {demandsPerMinute: 2}\n    namespace:"
+    config = load(configuration(edited("policy/access-domains.yaml", "    namespace:", quotas)))
+    throttle, names = RateLimit(), map(str, count())
 
-    def __init__(self) -> None:
-        self.throttle = RateLimit()
-        quotas = "    quotas: {demandsPerMinute: 2}\n    namespace:"
-        policy = edited("policy/access-domains.yaml", "    namespace:", quotas)
-        self._config = load(configuration(policy))
-        self._names = map(str, count())
-
-    def send(self, requester: str, at_s: float, operation: str = "") -> bool:
-        """Send a demand; return whether the limit allowed it."""
+    def allows(requester: str, at_s: float, operation: str = "") -> bool:
         app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
         request = Demand("join", "one", (Item(app, (requester,)),))
-        moment, name = NOW + timedelta(seconds=at_s), operation or next(self._names)
-        return not list(self.throttle.faults(request, self._config, name, moment))
+        moment, name = NOW + timedelta(seconds=at_s), operation or next(names)
+        return not list(throttle.faults(request, config, name, moment))
 
-
-def test_a_hand_in_that_is_judged_again_counts_once() -> None:
-    sending = Sending()
-    assert [sending.send("vehicle00", 0, "same") for _ in range(5)] == [True] * 5
-    assert sending.send("vehicle00", 1)
-    assert not sending.send("vehicle00", 2)
-
-
-def test_who_sends_no_more_is_forgotten() -> None:
-    sending = Sending()
+    assert [allows("a", 0, "judged again") for _ in range(5)] == [True] * 5
+    assert (allows("a", 1), allows("a", 2)) == (True, False)
     for number in range(500):
-        assert sending.send(f"vehicle{number}", number)
-    assert len(sending.throttle._seen) <= 62
-    assert sending.send("vehicle499", 499.5)
-    assert not sending.send("vehicle499", 499.6)
-
-
-def test_a_clock_that_is_set_back_does_not_shut_anybody_out() -> None:
-    sending = Sending()
-    assert [sending.send("vehicle00", at) for at in (5000, 5001)] == [True, True]
-    assert sending.send("vehicle00", 0)
+        assert allows(f"vehicle{number}", 10 + number)
+    assert len(throttle._seen) <= 62
+    assert (allows("vehicle499", 509.5), allows("vehicle499", 509.6)) == (True, False)
 
 
 def leased(*terms: tuple[str, int, int]) -> Ledger:
@@ -244,34 +223,15 @@ def ended(expiry: Agenda, ledger: Ledger) -> list[str]:
     return [claim.demand for claim in expiry.ended_claims(ledger)[1]]
 
 
-@pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
-def test_it_is_set_forward_and_a_full_term_is_granted(
-    clock: Clock, expiry: Agenda, steps: list[int], caplog: pytest.LogCaptureFixture
+def test_a_step_that_nobody_looked_at_is_noticed_later(
+    clock: Clock, expiry: Agenda, caplog: pytest.LogCaptureFixture
 ) -> None:
-    ledger = leased(("short", 60, 5), ("long", 600, 5))
-    for step in steps:
-        clock.set_by(step)
-        assert ended(expiry, ledger) == []
-    assert "the clock jumped forward by 3600 s, so leases get their full term" in caplog.text
-    for seconds, over in ((65, []), (1, ["short"]), (539, ["short"]), (1, ["short", "long"])):
-        clock.pass_(seconds)
-        assert ended(expiry, ledger) == over
-
-
-def test_the_claims_of_a_demand_end_together(clock: Clock, expiry: Agenda) -> None:
-    ledger = leased(("d", 60, 0), ("d", 600, 0))
-    clock.set_by(3600)
-    for seconds, over in ((0, []), (61, []), (540, ["d", "d"])):
-        clock.pass_(seconds)
-        assert ended(expiry, ledger) == over
-
-
-def test_a_step_that_nobody_looked_at_is_noticed_later(clock: Clock, expiry: Agenda) -> None:
     ledger = leased(("a", 60, 0))
     clock.pass_(50)
     clock.set_by(3600)
     clock.pass_(50)
     assert ended(expiry, ledger) == []
+    assert "the clock jumped forward by 3600 s, so leases get their full term" in caplog.text
     clock.pass_(61)
     assert ended(expiry, ledger) == ["a"]
 
@@ -303,7 +263,7 @@ def test_it_looks_again_when_the_first_lease_ends(clock: Clock, expiry: Agenda) 
 def test_an_end_that_moves_within_its_minute_is_seen(expiry: Agenda) -> None:
     ledger = leased(("a", 50, 0), ("b", 55, 0))
     assert leases_in(expiry, ledger) == pytest.approx(50, abs=0.1)
-    (claim,) = ledger.claims_of_demand("b")
+    (claim,) = ledger.claims_with("demand", "b")
     sooner = replace(claim, lease=Lease(20, 0, NOW + timedelta(seconds=20)))
     ledger = ledger.replace(claim.key, sooner)
     assert leases_in(expiry, ledger) == pytest.approx(20, abs=0.1)

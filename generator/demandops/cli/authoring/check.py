@@ -13,7 +13,7 @@ from demandops.base.quoting import lines, one_line
 from demandops.cli.formats import output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.queries.commits import entry_lines, release_lines
-from demandops.decide.changeset import FileChange
+from demandops.decide.state import FileChange
 from demandops.repo.merge_check import merge_check
 from demandops.repo.merge_check.merge_check import CheckResult
 from demandops.repo.merge_check.rendered_charts import MISSING, NO_HELM, RenderedCharts
@@ -314,7 +314,7 @@ def _lines(checked: CheckResult) -> Iterator[str]:
     if consequence and (consequence.files or checked.bookkeeping):
         compared = f", compared with {checked.base[:10]}" if checked.base else ""
         yield f"\nwhat merging would do{compared}:"
-    if checked.base and not checked.base_valid:
+    if consequence and checked.base and not checked.base_valid:
         yield f"({checked.base[:10]} is not valid, so what is in effect at it is compared)"
     for section in sections[len(checked.suggestions) :]:
         yield from section.text()

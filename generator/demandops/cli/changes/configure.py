@@ -399,7 +399,7 @@ def drain(node: str, options: Options) -> None:
 def undrain(node: str, options: Options) -> None:
     """Use a drained node again.
 
-    The command sets `drained: false` in the inventory. What was moved away stays where it is.
+    The command takes `drained: true` out of the inventory. What was moved away stays where it is.
 
     \b
     Examples:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
 from demandops.cli.changes import ledger_change
 from demandops.cli.changes.ledger_change import started_generator
+from demandops.cli.changes.person_change import confirm, consequence
 from demandops.cli.formats import faults_of, output_option, print_json
 from demandops.cli.output import console, done, errors, progress
 from demandops.cli.queries.commits import release_lines
@@ -34,7 +36,7 @@ from demandops.cli.target import (
     optional_repo_option,
     signing_option,
 )
-from demandops.decide.decision import decide
+from demandops.decide.decision import Decision, decide
 from demandops.model.config.base_model import duration_text
 from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
@@ -71,6 +73,7 @@ class Document:
 @optional_repo_option
 @dry_run_option
 @click.option("--release", is_flag=True, help="Release the demands of the documents instead.")
+@click.option("-y", "--yes", is_flag=True, help="With --release, do not ask.")
 @click.option("--renew", is_flag=True, help="Renew the demands of the documents instead.")
 @click.option(
     "--hold",
@@ -100,6 +103,7 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     state_repo: str,
     dry_run: bool,
     release: bool,
+    yes: bool,
     renew: bool,
     hold: bool,
     wait: bool,
@@ -168,6 +172,8 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
         elif dry_run:
             rows = _dry_run(documents, state_repo, output)
         else:
+            if release and not yes:
+                _confirm_release(documents, state_repo)
             rows = _book(documents, state_repo, wait, signing_key)
         _show_rows(rows, documents, output, dry_run)
     if via is None and output == "text" and not is_unread:
@@ -310,8 +316,9 @@ def _book(
     return rows
 
 
-def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Json]:
-    rows = []
+def _decided(
+    documents: list[Document], state_repo: str
+) -> Iterator[tuple[int, Document, Decision | InvalidInput]]:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         refuse_other_render_version(repo.objects, repo.repository.tip())
         state = repo.snapshot(progress=report).state
@@ -325,29 +332,49 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
             try:
                 decision = decide(state, document.goal, REAL.now(), read)
             except InvalidInput as error:
-                rows.append(_refused(index, document, error))
+                yield index, document, error
                 continue
             state = decision.state
             written.update(decision.files)
-            outcome = "proposed" if decision.approval else decision.outcome
-            if output == "text":
-                console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
-                for rule in decision.approval:
-                    console().print(f"  needs approval: {rule} requires it")
-                lines = [*release_lines(decision.releases)]
-                for path, text in sorted(decision.files.items()):
-                    lines.append(f"{'remove' if text is None else 'write '} {path}")
-                for line in lines:
-                    console().print(f"  {line}", soft_wrap=True)
-            more: Json = {
-                "warnings": decision.warnings,
-                "not_held": decision.changes.not_held,
-                "placed": decision.placed,
-                "releases": [asdict(release) for release in decision.releases],
-                "files": sorted(decision.files),
-            }
-            more |= {"approval": decision.approval} if decision.approval else {}
-            rows.append(_row(index, decision.request.id, outcome, **more))
+            yield index, document, decision
+
+
+def _confirm_release(documents: list[Document], state_repo: str) -> None:
+    decisions = [each for _, _, each in _decided(documents, state_repo)]
+    released = [each for each in decisions if not isinstance(each, InvalidInput)]
+    changes = [change for each in released for change in each.changes.claims]
+    claims = [change.before for change in changes if change.before and change.only_narrows]
+    who = {name for claim in claims for name in claim.requesters}
+    for line in consequence([r for each in released for r in each.releases], who, claims):
+        errors.print(line)
+    confirm("Continue?", yes=False)
+
+
+def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Json]:
+    rows = []
+    for index, document, decision in _decided(documents, state_repo):
+        if isinstance(decision, InvalidInput):
+            rows.append(_refused(index, document, decision))
+            continue
+        outcome = "proposed" if decision.approval else decision.outcome
+        if output == "text":
+            console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
+            for rule in decision.approval:
+                console().print(f"  needs approval: {rule} requires it")
+            lines = [*release_lines(decision.releases)]
+            for path, text in sorted(decision.files.items()):
+                lines.append(f"{'remove' if text is None else 'write '} {path}")
+            for line in lines:
+                console().print(f"  {line}", soft_wrap=True)
+        more: Json = {
+            "warnings": decision.warnings,
+            "not_held": decision.changes.not_held,
+            "placed": decision.placed,
+            "releases": [asdict(release) for release in decision.releases],
+            "files": sorted(decision.files),
+        }
+        more |= {"approval": decision.approval} if decision.approval else {}
+        rows.append(_row(index, decision.request.id, outcome, **more))
     return rows
 
 
@@ -365,8 +392,12 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
         elif row["outcome"] in ("refused", "unknown"):
             known = "refused" if row["outcome"] == "refused" else "has no known outcome"
             errors.print(f"{title} {known}")
+            by_text: dict[str, list[Fault]] = {}  # one reason may refuse several parts of a demand
             for each in row["faults"]:
-                errors.print(f"  {Fault(**each)}")
+                by_text.setdefault(each["message"], []).append(Fault(**each))
+            for first, *others in by_text.values():
+                places = f"; so are {', '.join(each.field for each in others)}" if others else ""
+                errors.print(f"  {first}{places}")
         elif not dry_run:
             told = row["outcome"] + (f" in {row['commit']}" if row["commit"] else "")
             if row.get("lease"):

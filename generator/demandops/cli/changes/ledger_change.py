@@ -31,6 +31,7 @@ from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.demand import goals
 from demandops.model.demand.demand import Decommission, Rollback
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo import reader
 from demandops.repo.history import commit_log
@@ -137,11 +138,13 @@ def claim_text(change: ClaimChange) -> str:
 
 
 def _end(name: str, kinds: Sequence[str], options: Options) -> None:
-    ended = name
+    ended, before = name, list[Claim]()
+    is_release = "demand" in kinds or "application" in kinds
 
     def goal_of(repo: Reader, state: State) -> Goal:
         nonlocal ended
         ended = _meant(name, kinds, state)
+        before.extend(state.ledger)
         by = str(repo.operator())
         return goals.decommission(ended, frozenset(kinds), by, options.reason)
 
@@ -159,7 +162,6 @@ def _end(name: str, kinds: Sequence[str], options: Options) -> None:
     if data["outcome"] == "unchanged":
         lines = [f"'{ended}' holds nothing"]
     elif data["commit"]:
-        is_release = "demand" in kinds or "application" in kinds
         lines.append(
             f"'{ended}' is {'released' if is_release else 'decommissioned'} in {data['commit']}"
         )
@@ -167,25 +169,36 @@ def _end(name: str, kinds: Sequence[str], options: Options) -> None:
             lines.append(
                 "if it is demanded again, it runs again; `demandops suspend` prevents that"
             )
+    # of an application the claims end, and what else their demands list stays
+    demands, keys = {change.key.demand for change in changes}, {change.key for change in changes}
+    kept = sorted({str(c.subject) for c in before if c.demand in demands and c.key not in keys})
+    if is_release and kept:
+        ways = (shlex.join(["demandops", "release", demand]) for demand in sorted(demands))
+        lines += [f"what these demands list besides stays: {', '.join(kept)}", "to end that too:"]
+        lines += [f"  {way}" for way in ways]
     show(options.output, {"name": ended, **data}, lines)
 
 
-def _meant(name: str, kinds: Iterable[str], state: State) -> str:
-    """Return the name; that of a demand may be its start, or the id of its request."""
+def _meant(name: str, kinds: Iterable[str], state: State, earlier: State | None = None) -> str:
+    """Return the name; that of a demand may be its start, or the id of its request.
+
+    A demand of an ``earlier`` state may have ended meanwhile.
+    """
     ledger = state.ledger
+    claims: list[Claim] = [*ledger, *(earlier.ledger if earlier else ())]
     known: dict[str, Iterable[str]] = {
         "node": {*state.config.nodes},
         "requester": ledger.indexed_names("requester"),
-        "demand": ledger.indexed_names("demand") | {*ledger.waiting},
+        "demand": {claim.demand for claim in claims} | {*ledger.waiting},
         "application": {*ledger.subjects(SubjectKind.APPLICATION)},
     }
     if any(name in known[kind] for kind in kinds):
         return name
     if "demand" in kinds:
-        of_request = {claim.demand for claim in ledger if claim.request == name}
+        of_request = {claim.demand for claim in claims if claim.request == name}
         starting = of_request or {id for id in known["demand"] if name and id.startswith(name)}
         if len(starting) == 1:
-            return starting.pop()
+            return min(starting)
         if starting:
             message = f"'{name}' fits several demands: {', '.join(sorted(starting)[:5])}; name one"
             raise InvalidInput.at("", message)
@@ -306,7 +319,9 @@ def rollback(
         nonlocal to, since
         to = resolved(repo, revision)
         since = repo.changed_files(to, repo.commit(), CONFIG_ROOTS)
-        named = {"demand": demand and _meant(demand, ["demand"], state), "application": application}
+        named = {"application": application}
+        if demand:
+            named["demand"] = _meant(demand, ["demand"], state, repo.snapshot(to).state)
         only = {key: id for key, id in named.items() if id}
         who = repo.operator()
         return goals.rollback(to, drop_newer=drop_newer, reason=options.reason, who=who, **only)

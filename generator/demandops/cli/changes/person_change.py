@@ -27,17 +27,20 @@ from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import formats, target
 from demandops.cli.output import done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.commits import differences, entry_lines, release_lines
-from demandops.decide.changeset import (
+from demandops.decide.planning.overrides import suspended_claims
+from demandops.decide.planning.planner import ReleaseKey
+from demandops.decide.state import (
     FileChange,
+    FileReader,
     ReleaseChange,
-    describe_change,
+    State,
+    described,
     planned_releases,
 )
-from demandops.decide.planning.overrides import suspended_claims
-from demandops.decide.state import State
 from demandops.model.ledger.claim import requesters_of
-from demandops.model.release import Release, claims_of
+from demandops.model.release import Release, ServiceRelease, claims_of
 from demandops.render import gitops
+from demandops.render.gitops import path_of
 from demandops.repo import reader
 from demandops.repo.forge import ForgeError, forge_for
 from demandops.repo.git.repository import PushDenied
@@ -56,6 +59,8 @@ from demandops.repo.write.proposal_branch import (
 from demandops.serve.proposal import merge_request
 from demandops.views import vocabulary
 from demandops.views.vocabulary import Json
+
+Releases = Mapping[ReleaseKey, Release]
 
 # ---- the options of all these commands ----
 
@@ -132,17 +137,21 @@ def count(number: int, what: str) -> str:
 
 
 def consequence(
-    releases: Collection[ReleaseChange], who: Collection[str], claims: Collection[object] = ()
+    releases: Collection[ReleaseChange],
+    who: Collection[str],
+    claims: Collection[object] = (),
+    stopped: int | None = None,
 ) -> Iterator[str]:
     """Yield the lines about the releases that change, and in capitals what stops or is released.
 
     ``claims`` are those that are released or reduced, ``who`` are their requesters, or those of the
-    releases that stop.
+    releases that stop. ``stopped`` is the number of these, by default of those that are removed.
     """
     yield from (f"  {line}" for line in release_lines([*releases][:_MOST_SHOWN]))
     if len(releases) > _MOST_SHOWN:
         yield f"  and {count(len(releases) - _MOST_SHOWN, 'more release')} (-o json lists all)"
-    stopped = sum(release.change == "stop" for release in releases)
+    if stopped is None:
+        stopped = sum(release.change == "stop" for release in releases)
     verbs = [f"RELEASES {count(len(claims), 'claim')}"] if claims else []
     verbs += [f"STOPS {count(stopped, 'release')}"] if stopped else []
     if verbs:
@@ -162,6 +171,18 @@ def warned_if_unnamed(person: Person) -> Person:
 
 
 # ---- a commit of a person ----
+
+
+def _runs(release: Release | None) -> bool:
+    return release is not None and not (
+        isinstance(release, ServiceRelease) and release.replicas == 0
+    )
+
+
+def _stopped(old: Releases, new: Releases, read: FileReader) -> list[Release]:
+    # what has no file has not started yet
+    ended = (each for key, each in old.items() if _runs(each) and not _runs(new.get(key)))
+    return [release for release in ended if read(path_of(release)) is not None]
 
 
 @contextmanager
@@ -188,28 +209,26 @@ def commit(
         before = repo.snapshot(progress=report)
         after = person_commit.state_after(repo.repository, before, files)
 
-    def text(release: Release | None, state: State) -> object:
+    def text(release: Release | None, state: State) -> str | None:
         with suppress(InvalidInput):
-            return release and gitops.render(release, state.config, state.evaluate)
+            return gitops.render(release, state.config, state.evaluate) if release else None
         return None
 
     old, new = planned_releases(before.state), planned_releases(after)
     changes = []
     for key in {**old, **new}:
         was, now = old.get(key), new.get(key)
-        change = describe_change(was, now, key in old)
         # a release also has what no file shows, such as whether its node is drained
-        if change.change != "change" or (
-            was != now and (change.details or text(was, before.state) != text(now, after))
-        ):
-            changes.append(change)
+        if was != now:
+            change = described(was, now, text(was, before.state), text(now, after))
+            changes += [change] if change.change != "change" or change.details else []
     changes.sort(key=lambda change: (change.change, change.name))
-    stopped = [release for key, release in old.items() if key not in new]
+    stopped = _stopped(old, new, repo.file_reader())
     who = {name for r in stopped for name in requesters_of(claims_of(r, before.state.ledger))}
     suspended = {claim.key for claim, _ in suspended_claims(before.state)}
     claims = [claim for claim, _ in suspended_claims(after) if claim.key not in suspended]
     of_command, lines = more(before.state, after)
-    told = [f"{summary} ({', '.join(files)})", *lines, *consequence(changes, who)]
+    told = [f"{summary} ({', '.join(files)})", *lines, *consequence(changes, who, (), len(stopped))]
     told = [fitted(line, terminal_width()) for line in told]
     data: Json = {
         "outcome": "would-change",

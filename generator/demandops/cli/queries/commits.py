@@ -10,7 +10,13 @@ from typing import Any
 
 import click
 
-from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
+from demandops.base.errors import (
+    BeforeTheFirst,
+    InvalidInput,
+    StateRepoError,
+    fault,
+    suggestion,
+)
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli.formats import Table, list_table, output_formats, output_option, show, table_of
@@ -18,7 +24,7 @@ from demandops.cli.output import SIGNS, at_option, busy, errors, progress
 from demandops.cli.target import name_options, state_repo_option
 from demandops.decide.bookkeeping import EntryChange, as_data, bookkeeping_changes
 from demandops.decide.bookkeeping import bookkeeping as derive
-from demandops.decide.changeset import MergePreview, ReleaseChange, planned_releases, preview
+from demandops.decide.state import MergePreview, ReleaseChange, planned_releases, preview
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
 from demandops.repo.history import commit_log
@@ -110,7 +116,11 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
       demandops diff main~1 main
     """
     with reader.opened(state_repo) as repo:
-        entries, changes = differences(repo, before, after)
+        try:
+            entries, changes = differences(repo, before, after)
+        except BeforeTheFirst as error:
+            errors.print(f"{error}, which is compared with")
+            entries, changes = differences(repo, error.first, after)
     data = {
         "bookkeeping": [asdict(entry) for entry in entries],
         "releases": [asdict(release) for release in changes.releases],
@@ -201,7 +211,7 @@ _TRAILERS = {
 }
 
 
-def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
+def time_of(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
     if text is None:
         return None
     time = commit_log.parse_time(text, REAL.now(), end=param.name == "until")
@@ -236,12 +246,12 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
 )
 @click.option(
     "--since",
-    callback=_time,
+    callback=time_of,
     metavar="TIME",
     help=f"List only commits at or after this time: {commit_log.TIMES}.",
 )
 @click.option(
-    "--until", callback=_time, metavar="TIME", help="List only commits at or before this time."
+    "--until", callback=time_of, metavar="TIME", help="List only commits at or before this time."
 )
 @click.option(
     "-n",
@@ -284,16 +294,22 @@ def log(
                     "`demandops status` lists the current ones"
                 )
         commits = repo.log(commit_range, path) if path else repo.log(commit_range)
-        wanted = [(_TRAILERS[name], given[name]) for name in _TRAILERS if given[name] is not None]
+        wanted = [(name, given[name]) for name in (*_TRAILERS, "node") if given[name] is not None]
+
+        def is_about(entry: LogEntry, kind: str, name: str) -> bool:
+            named = entry.trailers.get(_TRAILERS.get(kind, ""), ())
+            # the trees of a commit are read last
+            return name in named or (
+                (kind == "node" and repo.changes_node(entry.commit, name))
+                or (kind != "demand" and repo.edits(entry, kind, name))
+            )
 
         def matches(entry: LogEntry) -> bool:
             return (
-                all(value in entry.trailers.get(trailer, ()) for trailer, value in wanted)
-                and given["operation"] in (None, entry.first("Operation") or "by-hand")
+                given["operation"] in (None, entry.first("Operation") or "by-hand")
                 and (given["since"] is None or entry.time >= given["since"])
                 and (given["until"] is None or entry.time <= given["until"])
-                # last, because it reads the trees of the commit
-                and (given["node"] is None or repo.changes_node(entry.commit, given["node"]))
+                and all(is_about(entry, *each) for each in wanted)
             )
 
         with busy("looking through the commits"):

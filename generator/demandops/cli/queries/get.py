@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,11 @@ from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import formats
 from demandops.cli.formats import Table, list_table
 from demandops.cli.output import at_option, errors, warn_of_not_rendered
-from demandops.cli.queries.commits import loaded
+from demandops.cli.queries.commits import loaded, time_of
 from demandops.cli.queries.status import ask_clusters
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.cluster import clusters_file
-from demandops.model.config.base_model import matches
+from demandops.model.config.base_model import matches, parse_time
 from demandops.model.config.repo_settings import Proposals
 from demandops.repo import reader
 from demandops.repo.forge import ForgeError, forge_for
@@ -37,12 +38,20 @@ from demandops.views.source import Source
 FILTERS = ("node", "requester", "application", "domain")
 
 
+# What people mean by other words.
+_MEANT = {"app": "applications", "commit": "events", "type": "appdefs", "vehicle": "nodes"}
+# The kinds of which a shell completes the names, with the kind that has the same names.
+_COMPLETED = {"leases": "demands", "services": "releases"} | dict.fromkeys(
+    ("applications", "connections", "demands", "nodes", "overrides", "proposals", "releases"), ""
+)
+
+
 def _kind_named(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
     if value is None:
         raise click.UsageError(f"Missing argument 'KIND': one of {', '.join(KINDS)}", ctx)
-    for name in (value, f"{value}s"):
-        if name.lower() in KINDS:
-            return name.lower()
+    word = value.lower().removesuffix("s")
+    if (name := _MEANT.get(word, f"{word}s")) in KINDS:
+        return name
     raise click.BadParameter(
         f"there is no kind '{value}'{suggestion(value, KINDS)}; the kinds are {', '.join(KINDS)}"
     )
@@ -50,9 +59,8 @@ def _kind_named(ctx: click.Context, param: click.Parameter, value: str | None) -
 
 def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     kind = ctx.params.get("kind") or ""
-    same = ("applications", "connections", "demands", "nodes", "overrides", "proposals", "releases")
-    kinds = {"leases": "demands", "services": "releases"} | {name: name for name in same}
-    return names_of(kinds[kind])(ctx, param, incomplete) if kind in kinds else []
+    same = _COMPLETED.get(kind)
+    return [] if same is None else names_of(same or kind)(ctx, param, incomplete)
 
 
 @click.command()
@@ -83,6 +91,12 @@ def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
 )
 @click.option("--sort-by", metavar="COLUMN", help="A column, or -COLUMN for the reverse order.")
 @click.option("--gone", is_flag=True, help="List what is not there any more, and who ended it.")
+@click.option(
+    "--since",
+    callback=time_of,
+    metavar="TIME",
+    help="List only events at or after this time, and other items that began then: 2h, 14:03.",
+)
 @at_option
 @click.option(
     "--clusters",
@@ -122,6 +136,7 @@ def get(
       demandops get demands --requester vehicle00
       demandops get releases -l cluster=edge --sort-by node
       demandops get demands --gone
+      demandops get events --since 2h
       demandops get nodes --domain perception -o name
       demandops get releases -o jsonpath='{.items[*].name}'
       demandops get leases --watch
@@ -130,15 +145,10 @@ def get(
     if watch and at:
         raise click.UsageError("--watch follows the newest commit, so leave out --at")
     listed = KINDS[kind]
-    if asked["gone"] and (watch or not listed.trailer):
-        past = ", ".join(name for name, each in KINDS.items() if each.trailer)
+    if asked["gone"] and (watch or not listed.has_past):
+        past = ", ".join(name for name, each in KINDS.items() if each.has_past)
         raise click.UsageError(f"--gone lists {past}, without --watch")
-    wanted = [(name, asked[name], f"--{name}") for name in FILTERS if asked[name] is not None]
-    for selector in filter(None, ",".join(asked["selectors"]).split(",")):
-        label, equals, value = selector.partition("=")
-        if not (label and equals and value.lstrip("=")):
-            raise click.UsageError(f"--selector: {quoted(selector)} is not LABEL=VALUE")
-        wanted.append((label.strip(), value.lstrip("=").strip(), "--selector"))
+    wanted, since = _labels_wanted(asked), asked["since"]
     columns, sort_by = {column.key: column for column in listed.columns}, asked["sort_by"] or ""
     by = sort_by.removeprefix("-").lower()
     if sort_by and by not in columns:
@@ -161,6 +171,7 @@ def get(
             for row in rows
             if (not names or any(matches(name, names) for name in row.labels[listed.word]))
             and chosen.matches(row)
+            and (since is None or (_began(row) or since) >= since)
         ]
         return sorted_rows(rows, columns[by], source.now, down=sort_by != by) if sort_by else rows
 
@@ -189,6 +200,22 @@ def get(
             before, rows = rows, choose(rows_of(source, kind))
             if [row.item for row in rows] != [row.item for row in before]:
                 _print_list(listed, source, rows, output, watch)
+
+
+def _labels_wanted(asked: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    # each with the option that names it
+    wanted = [(name, asked[name], f"--{name}") for name in FILTERS if asked[name] is not None]
+    for selector in filter(None, ",".join(asked["selectors"]).split(",")):
+        label, equals, value = selector.partition("=")
+        if not (label and equals and value.lstrip("=")):
+            raise click.UsageError(f"--selector: {quoted(selector)} is not LABEL=VALUE")
+        wanted.append((label.strip(), value.lstrip("=").strip(), "--selector"))
+    return wanted
+
+
+def _began(row: Row) -> datetime | None:
+    time = row.item.get("time") or row.item.get("since")
+    return parse_time(time) if time else None
 
 
 def _with_proposals(source: Source, repo: Reader) -> Source:
@@ -227,10 +254,13 @@ def _refuse_unknown(
         "application": ledger.subjects(SubjectKind.APPLICATION),
         "cluster": config.clusters,
     }
-    labels = {label: None for row in rows for label in row.labels}
+    labels = {label for row in rows for label in row.labels}
+    if wanted and not rows:  # then what some kind of thing has is no mistake
+        labels = {label for name in KINDS for row in rows_of(source, name) for label in row.labels}
+        labels |= {column.key.removesuffix("s") for column in kind.columns} | {*FILTERS, kind.word}
     asked = [(name, "", {row.item["name"] for row in rows}) for name in names]
     for label, pattern, option in wanted:
-        if rows and label not in labels:
+        if label not in labels:
             raise click.UsageError(
                 f"{option}: {kind.name} have no {label}; they have {', '.join(sorted(labels))}"
             )

@@ -8,10 +8,11 @@ from dataclasses import asdict
 
 import click
 
+from demandops.base.errors import suggestion
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.runtime import REAL
 from demandops.cli.formats import output_formats, output_option, show
-from demandops.cli.output import at_option, busy, fitted, terminal_width
+from demandops.cli.output import at_option, busy, errors, fitted, terminal_width
 from demandops.cli.queries.commits import loaded
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.decide.decision import may_demand
@@ -147,7 +148,7 @@ def _override_text(override: Json) -> str:
 def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
     when, word = time_text(entry["time"]), entry["operation"] or "by hand"
     yield f"  {entry['commit'][:10]} {when}  {word}, {entry['author']}: {entry['summary']}"
-    if why and entry["why"]:
+    if entry["why"] and (why or not entry["operation"]):  # a person's reason is nowhere else
         yield f"    {entry['why']}"
     if entry["decision"]:
         yield f"    {decision_text(entry['decision'])}"
@@ -256,6 +257,10 @@ def may(
     else:
         lines = [f"yes: {what}"]
         lines += [f"  {rule} allows it" for rule in answer.rules]
+    known = {*state.config.nodes, *state.ledger.indexed_names("requester")}
+    if requester not in known:
+        unknown = f"no node is called '{requester}', and nobody of this name demands anything now"
+        errors.print(f"note: {unknown}{suggestion(requester, known)}")
     data = {"requester": requester, "application": application, "allowed": not answer.faults}
     faults = [asdict(each) for each in answer.faults]
     show(output, data | asdict(answer) | {"faults": faults}, lines)

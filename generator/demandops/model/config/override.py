@@ -7,7 +7,7 @@ between two of them, and ``decide.planning.overrides`` applies overrides to rele
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Any, Literal, TypeVar
@@ -189,6 +189,15 @@ class OverrideFile(FileModel):
         return parse_time(self.expires) if self.expires else None
 
 
+def override_selects(text: str, kind: str, name: str) -> bool:
+    """Return whether a file's text selects a thing by its name; one that is not valid does not."""
+    try:
+        selectors = base_model.parse_file(OverrideFile, text, "").select
+    except InvalidInput:
+        return False
+    return any(matches(name, getattr(each, f"{kind}s") or ()) for each in selectors)
+
+
 class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so they have no hash
     """An override with its name, which is its file's name."""
 
@@ -257,8 +266,3 @@ def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) ->
         return settings.model_validate({k: v for k, v in data.items() if k not in of_mqtt - own})
     except ValidationError as error:
         raise InvalidInput(base_model.faults_of(error, type(settings), file, ("values",))) from None
-
-
-def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
-    # the order in which they apply; the last one wins
-    return tuple(sorted(overrides, key=lambda override: (override.priority, override.name)))

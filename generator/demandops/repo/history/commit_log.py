@@ -16,7 +16,7 @@ import pygit2
 from pygit2 import Commit, Oid, Repository
 from pygit2.enums import SortMode
 
-from demandops.base.errors import StateRepoError
+from demandops.base.errors import BeforeTheFirst, StateRepoError
 from demandops.base.quoting import one_line, quoted
 from demandops.base.settings import GENERATED_ROOTS
 from demandops.model.config.base_model import seconds_of
@@ -112,7 +112,7 @@ def entry_of(commit: Commit) -> LogEntry:
         author=_name_and_email(commit.author)[0],
         summary=text.summary,
         trailers=text.trailers if is_told else {},
-        why=text.why if is_told else "",
+        why=text.why if is_told else one_line(text.body),
         by_generator=is_ours and not is_proposal and "Render-Version" in text.trailers,
         authored=_time(commit.author.time),
     )
@@ -312,14 +312,21 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
     return next(current, None) or next(iter(_removed(repo, tip, f"{name}.yaml", "-1")), None)
 
 
-def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    removed = _removed(repo, tip, "*.yaml")
-    names = {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
-    return {name for name in names if _NAME.fullmatch(name)}  # a chart's file has a version
+def stopped_releases(repo: Repository, tip: str | Oid) -> dict[str, list[str]]:
+    """Return the names of the releases that each commit removed."""
+    removed, commit = dict[str, list[str]](), ""
+    for item in _removed(repo, tip, "*.yaml", form="%H"):
+        if "/" not in item:
+            commit = item
+            continue
+        name = item.rsplit("/", 1)[-1].removesuffix(".yaml")
+        if _NAME.fullmatch(name):  # a chart's file has a version
+            removed.setdefault(commit, []).append(name)
+    return removed
 
 
-def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[str]:
-    options = ("--diff-filter=D", "--no-renames", *more, "--format=", "--name-only")
+def _removed(repo: Repository, tip: str | Oid, file: str, *more: str, form: str = "") -> list[str]:
+    options = ("--diff-filter=D", "--no-renames", *more, f"--format={form}", "--name-only")
     return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
 
 
@@ -502,9 +509,10 @@ def _commit_named(
         for commit in first_parents(repo, tip):
             if commit.commit_time <= latest:
                 return commit
-        raise StateRepoError(
+        raise BeforeTheFirst(
             f"at {time_text(at)} the state repo did not exist yet; its first commit is of "
-            f"{time_text(time_of(commit))}"
+            f"{time_text(time_of(commit))}",
+            str(commit.id),
         )
     commits = {name: repo.references[name].peel(Commit) for name in names}
     if base == "HEAD":

@@ -14,8 +14,8 @@ from demandops.base.naming import SubjectKind
 from demandops.base.quoting import escaped, harmless, is_visible, one_line
 from demandops.base.settings import RENDER_VERSION
 from demandops.decide.booking import Drain, Restoration
-from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision
+from demandops.decide.state import ReleaseChange
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.model.demand.demand import Decommission
 from demandops.model.ledger import claim as claim_files
@@ -48,6 +48,7 @@ class MessageText:
     summary: str
     why: str
     trailers: dict[str, list[str]]
+    body: str = ""  # the first paragraph after the summary, which people write
 
 
 def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
@@ -69,6 +70,7 @@ def parse(message: str) -> MessageText:
     whys = (line.removeprefix(_WHY) for line in lines if line.startswith(_WHY))
     trailers: dict[str, list[str]] = {}
     head, _, last = message.rstrip("\n").rpartition("\n\n")
+    body = next(iter(message.rstrip("\n").split("\n\n")[1:]), "")
     for line in last.split("\n") if head else ():
         key, colon, value = line.partition(": ")
         if not colon or not _KEY.fullmatch(key):
@@ -80,7 +82,8 @@ def parse(message: str) -> MessageText:
                 value[1:-1],
             )
         trailers.setdefault(key, []).append(value)
-    return MessageText(lines[0], next(whys, ""), trailers)
+    is_text = body != last or not trailers
+    return MessageText(lines[0], next(whys, ""), trailers, body if is_text else "")
 
 
 # The trailer that names the branch on which a commit was proposed for approval.
