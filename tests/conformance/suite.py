@@ -86,6 +86,7 @@ class Servers:
         if self.are_asked:
             self._books = self.client.node.create_client(GetBookkeeping, bookkeeping)
             self.client.wait(self._books.service_is_ready)
+            self.client.ask(lambda: self._books.call_async(GetBookkeeping.Request()))
 
     def close(self) -> None:
         self.client.close()
@@ -111,10 +112,13 @@ class Servers:
         return Answer(True, answer.outcome or "no outcome", text)
 
     def books(self) -> dict[str, Any]:
+        """Return who requests what, and the commit that says so; nothing if nobody can be asked."""
+        data: dict[str, Any] = {"services": {}, "connections": {}, "commit": "none"}
+        if not self.are_asked:
+            return data
         asked = self._books.call_async(GetBookkeeping.Request())
         self.client.wait(asked.done)
-        data: dict[str, Any] = json.loads(asked.result().bookkeeping_json or "{}")
-        return {"services": {}, "connections": {}, "commit": "none"} | data
+        return data | json.loads(asked.result().bookkeeping_json or "{}")
 
 
 # ---- a rule of rules.yaml ----
@@ -127,13 +131,17 @@ class Rule:
         self._name, self._steps, self._servers = name, steps, servers
 
     def try_it(self) -> None:
+        books = self._servers.books()
         try:
             for number, step in enumerate(self._steps, 1):
                 answer = self._send(step)
                 if not answer.is_as(step["is"], step.get("says", "")):
                     raise Unlike(f"goal {number} must be {step['is']}; {answer}")
+                before, books = books, self._servers.books()
+                if step["is"] not in ("booked", "released") and books != before:
+                    raise Unlike(f"goal {number} is {step['is']}, and made {books['commit']}")
                 if self._servers.are_asked:
-                    self._compare(number, step)
+                    self._compare(number, step, books)
         finally:
             for step in self._steps:  # end what was booked, so that no rule meets another
                 verb = self._verb(step)
@@ -141,8 +149,7 @@ class Rule:
                     rest = {key: step[key] for key in ("who", "id", "of", "node") if key in step}
                     self._send(rest | {ENDS[verb]: ""})
 
-    def _compare(self, number: int, step: dict[str, Any]) -> None:
-        books = self._servers.books()
+    def _compare(self, number: int, step: dict[str, Any], books: dict[str, Any]) -> None:
         tables: dict[str, Iterable[dict[str, list[str]]]] = {
             "held": (entry["topics"] for entry in books["connections"].values()),
             "read": (
@@ -190,6 +197,38 @@ class Rule:
         ends = ("vehicle00", node)
         item = goals.connection(on, who=who, ends=ends, topics=topics, broker="")
         return self._servers.deploy(goals.goal([], [item | more], id=id, shutdown=is_shutdown))
+
+
+def random_steps(seed: int, count: int = 40) -> Iterator[dict[str, Any]]:
+    """Yield joins and shutdowns by a few parties, with what ten lines of bookkeeping say of each.
+
+    A party is a request id with its requesters. It holds what it joined and has not shut down, and
+    no party takes from another. In the end each shuts down all, and nothing is left.
+    """
+    chance = random.Random(seed)
+    held: dict[tuple[str, str], set[str]] = {
+        party: set() for party in product(("vehicle00", "vehicle01", "station00 vehicle00"), "rs")
+    }
+    goals_of = [
+        (party, chance.sample("abc", chance.randint(1, 3)), chance.random() < 0.5)
+        for party in chance.choices([*held], k=count)
+    ]
+    for party, topics, joins in [*goals_of, *((party, [], False) for party in held)]:
+        before = held[party]
+        held[party] = before | {*topics} if joins else before - {*(topics or before)}
+        changed = held[party] != before
+        outcome = ("booked" if changed else "unchanged") if joins else "released"
+        requesters = {
+            topic: {each for (who, _), own in held.items() if topic in own for each in who.split()}
+            for topic in set[str]().union(*held.values())
+        }
+        yield {
+            "join" if joins else "shutdown": " ".join(topics),
+            "who": party[0],
+            "id": party[1],
+            "is": outcome if joins or changed else "not-held",
+            "held": {topic: " ".join(who) for topic, who in requesters.items()},
+        }
 
 
 # ---- the wire ----
@@ -248,7 +287,7 @@ def an_ended_goal_cannot_be_cancelled(servers: Servers) -> None:
 
 def the_paper_s_table(servers: Servers, orders: Iterable[tuple[int, ...]]) -> None:
     """Let vehicles join and leave; the steps of each order are numbered as in the paper."""
-    before = paper.observed(servers.books()) if servers.are_asked else {}
+    before = paper.observed(servers.books())
     for order in orders:
         inside: set[str] = set()
         for step in order:
@@ -279,7 +318,9 @@ def orders(seed: int, *, every: bool) -> list[tuple[int, ...]]:
 # ---- all rules ----
 
 
-def all_rules(servers: Servers, played: list[tuple[int, ...]]) -> Iterator[tuple[str, str, Any]]:
+def all_rules(
+    servers: Servers, played: list[tuple[int, ...]], seed: int
+) -> Iterator[tuple[str, str, Any]]:
     """Yield each rule's name, how the reference differs, and a function that tries the rule."""
     yield "the feedback has the type of the action", "", partial(feedback_has_the_type, servers)
     again = partial(a_result_can_be_asked_for_again, servers)
@@ -296,15 +337,18 @@ def all_rules(servers: Servers, played: list[tuple[int, ...]]) -> Iterator[tuple
         for number, entry in enumerate(rules):
             rule = Rule(f"{action}{number}", entry["steps"], servers)
             yield f"{action}: {entry['rule']}", entry.get("reference", ""), rule.try_it
+    steps = [*random_steps(seed)]
+    counted = f"{len(steps)} random joins and shutdowns are counted, and nothing is left"
+    yield counted, "all rows of counting", Rule("random", steps, servers).try_it
     plain_text = "its feedback and its results are plain text"
     stages = "each stage is told, in order, and of what is refused at most the first"
     yield stages, plain_text, partial(stages_are_told, servers)
 
 
 def verdicts(
-    servers: Servers, played: list[tuple[int, ...]], *, is_reference: bool = False
+    servers: Servers, played: list[tuple[int, ...]], seed: int, *, is_reference: bool = False
 ) -> Iterator[Verdict]:
-    for name, difference, try_it in all_rules(servers, played):
+    for name, difference, try_it in all_rules(servers, played, seed):
         try:
             try_it()
         except Unlike as unlike:
