@@ -177,10 +177,5 @@ def test_a_claim_that_a_person_edited_is_read_strictly(case: dict[str, str]) -> 
     assert case["says"] in found.message
 
 
-def test_a_file_that_is_no_mapping_is_told_the_format_of_its_kind() -> None:
-    with pytest.raises(InvalidInput, match=r"starts with apiVersion: demandops\.ledger/v3"):
-        claim_files.read("[]", CASES["path"])
-
-
 def test_half_a_character_in_a_forged_trailer_has_a_path_segment() -> None:
     assert claim_files.segment("\ud800") != claim_files.segment("\ud801")
