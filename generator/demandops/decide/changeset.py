@@ -19,7 +19,7 @@ from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Changes, World
-from demandops.model.release import Release
+from demandops.model.release import Release, ServiceRelease
 from demandops.render import gitops
 from demandops.render.gitops import path_of
 from demandops.templating.values import Evaluate
@@ -37,6 +37,13 @@ CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
 FileReader = Callable[[str], str | None]
 
 
+# what a change does to the pods of a release; empty if nothing
+Effect = Literal["starts", "restarts", "reconfigures", "stops", ""]
+
+# values of every chart that do not restart the pods that run
+_ALWAYS_LIVE = frozenset({"replicas", "autoscaler"})
+
+
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
     """A release that starts, changes or stops; ``details`` has a line for each changed fact."""
@@ -46,6 +53,13 @@ class ReleaseChange:
     file: str
     change: Change
     details: tuple[str, ...] = ()
+    effect: Effect = ""
+
+    @property
+    def title(self) -> str:
+        # a sign before it says what starts and what stops
+        effect = f", {self.effect}" if self.change == "change" and self.effect else ""
+        return f"{self.name} ({self.what}){effect}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +160,7 @@ def render_change(
         if text is not None and text == current:
             continue
         if old or new:
-            releases.append(describe_change(old, new, current is not None))
+            releases.append(describe_change(old, new, current, text))
     _refuse_large(files, config.repo_settings.limits.file_bytes, read)
     releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
@@ -168,10 +182,13 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
         raise Refused(faults)
 
 
-def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
-    """Return how a release changes; ``existed`` says that it had a file before."""
+def describe_change(
+    old: Release | None, new: Release | None, current: str | None, text: str | None
+) -> ReleaseChange:
+    """Return how a release changes, and with it its file, from the text ``current`` to ``text``."""
     release = new or old
     assert release is not None  # noqa: S101 - a change has at least one side
+    existed = current is not None
     kind: Change = "stop" if not new else "change" if existed else "start"
     details: list[str] = []
     if new and existed:
@@ -187,7 +204,23 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
         old_facts, new_facts = frozenset(before), frozenset(after)
         details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
         details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
-    return ReleaseChange(release.name, release.description, path_of(release), kind, tuple(details))
+    effect = _effect(release, current, text)
+    return ReleaseChange(
+        release.name, release.description, path_of(release), kind, tuple(details), effect
+    )
+
+
+def _effect(release: Release, current: str | None, text: str | None) -> Effect:
+    if current is None or text is None:
+        return "stops" if text is None else "starts"
+    (was, before), (now, after) = map(gitops.values_apart, (current, text))
+    if before != after:
+        return "restarts"
+    if was == now:  # only comments differ, which name overrides
+        return ""
+    live = {*release.service.live, *_ALWAYS_LIVE} if isinstance(release, ServiceRelease) else set()
+    differing = {name for name in {**was, **now} if was.get(name, ABSENT) != now.get(name, ABSENT)}
+    return "reconfigures" if differing <= live else "restarts"
 
 
 # ---- the releases and files that differ between two commits, or before and after a merge ----
@@ -299,7 +332,7 @@ def preview(
             continue
         of_releases |= {old_path, new_path}
         text = current.get(old_path or new_path)
-        change = describe_change(before, after, text is not None)
+        change = describe_change(before, after, text, files.get(new_path))
         if change.change == "change" and old_path and old_path != new_path:
             moved = (f"- {old_path}", f"+ {new_path}")
             change = replace(change, details=(*moved, *change.details))
