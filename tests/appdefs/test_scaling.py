@@ -9,7 +9,7 @@ from typing import Any, Literal
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops.decide.override_report import override_report, warnings
-from demandops.decide.planning.release_keys import affected_keys
+from demandops.decide.planning.planner import affected_keys
 from demandops.decide.state import rendered_files, try_configuration
 from demandops.model.release import ServiceKey
 

@@ -15,14 +15,15 @@ from typing import Any
 from demandops.base.errors import InvalidInput
 from demandops.connections import connection
 from demandops.connections.connection import ConnectionType, Route
-from demandops.decide import booking, changeset, decision, edits
+from demandops.decide import booking, decision, edits
 from demandops.decide.admission import completing, permission
 from demandops.decide.checks import forbidden
+from demandops.decide.checks.forbidden import Usage
 from demandops.decide.decision import Decision
-from demandops.decide.placement import capacity, placement
+from demandops.decide.placement import placement
 from demandops.decide.placement.candidates import Choice
-from demandops.decide.placement.capacity import Usage
-from demandops.decide.planning import overrides, planner, release_keys
+from demandops.decide.planning import overrides, planner
+from demandops.decide.state import Changeset
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Lease
 from demandops.model.ledger import ledger
@@ -230,7 +231,7 @@ plant("let_others_overtake_in_a_batch", 7, Agenda, "book_those_let_in", nothing)
 plant("leave_drained_nodes_full", 9, agenda, "_to_drain", lambda *_: [])
 plant("place_on_drained_nodes", 12, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 1, placement, "_booked", nothing)
-plant("count_no_room", 7, capacity, "excesses", lambda *_: [])
+plant("count_no_room", 7, forbidden, "excesses", lambda *_: [])
 
 
 @wrong(0, Usage, "plus")
@@ -241,7 +242,7 @@ def count_released_room_as_taken(plus: Any, usage: Any, more: Any) -> Any:
 # ---- overrides ----
 
 
-@wrong(16, changeset, "plan_change")
+@wrong(16, decision, "plan_change")
 def apply_no_override_to_what_a_demand_changes(
     plan: Any, before: Any, after: Any, *more: Any
 ) -> Any:
@@ -251,7 +252,7 @@ def apply_no_override_to_what_a_demand_changes(
 
 @wrong(0, snapshot, "render_all")
 def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any = None) -> Any:
-    return changeset.Changeset({**(more or {})}, ())
+    return Changeset({**(more or {})}, ())
 
 
 plant("let_the_lowest_priority_win", 16, ledger, "by_rank", in_reverse)
@@ -263,7 +264,6 @@ def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bo
 
 
 plant("run_what_is_denied", 14, planner, "without_suspended", itself)
-plant("run_what_is_denied", 14, release_keys, "without_suspended", itself)
 plant("book_what_is_denied", 19, forbidden, "denial_faults", lambda *_: ())
 
 

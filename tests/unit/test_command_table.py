@@ -96,7 +96,7 @@ def parse(command: click.Command, words: list[str], parent: click.Context | None
     [
         (["serve"], "rclpy", ("demandops_ros.", "rclpy."), "see README.md, 'With ROS 2'"),
         (["diff", "a", "b"], "difflib",
-         ("demandops.cli.queries.commits", "demandops.decide.changeset"),
+         ("demandops.cli.queries.commits", "demandops.decide.state"),
          "install demandops again"),
     ],
 )  # fmt: skip

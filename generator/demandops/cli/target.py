@@ -16,8 +16,7 @@ from demandops.base.errors import InvalidInput, StateRepoError, suggestion
 from demandops.base.naming import SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.strict_yaml import located_in
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import all_keys
+from demandops.decide.planning.planner import all_keys, plan
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, parse_file
 from demandops.repo import reader
 from demandops.repo.git.remote_repository import checkout_around, is_url, origin_of

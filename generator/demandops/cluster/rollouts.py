@@ -27,8 +27,7 @@ from demandops.cluster.health import (
 from demandops.cluster.watches import ObjectCache, object_caches
 from demandops.decide.decision import Decision
 from demandops.decide.planning.overrides import without_suspended
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import affected_keys, keys_of_claims
+from demandops.decide.planning.planner import affected_keys, keys_of_claims, plan
 from demandops.decide.state import State
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.repo_settings import RepoSettings
@@ -47,7 +46,7 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
     # out, even if they share a subject with this one
     after, request = decision.state, decision.request
     active = without_suspended(after)
-    claims = [*active.ledger.claims_of_demand(request.demand)]
+    claims = [*active.ledger.claims_with("demand", request.demand)]
     for demanded in request.demanded if request.adds_claims else ():
         own = demand_id(request.id, demanded.requesters)  # that of a join
         if claim := active.ledger.get(ClaimKey(demanded.held.subject, own)):

@@ -387,8 +387,9 @@ _LONGEST_TOPICS = 120
 class ConnectionType(ABC):
     """How clients carry a connection. Each subclass has one instance."""
 
-    # The type's name in messages; files, templates and clients use `word` instead
+    # The type's name in messages, and in files, templates and clients
     name: ClassVar[str]
+    word: ClassVar[str]
     # The type's number in `DeploymentRequest`
     number: ClassVar[int]
     # The name of the clients' image in the registry
@@ -411,10 +412,6 @@ class ConnectionType(ABC):
 
     def __repr__(self) -> str:
         return self.name
-
-    @property
-    def word(self) -> str:
-        return self.name.lower()
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
         return iter(())

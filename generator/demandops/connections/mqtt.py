@@ -31,7 +31,7 @@ _NO_BROKER = "no-broker"
 
 
 class Mqtt(ConnectionType):
-    name = "MQTT"
+    name, word = "MQTT", "mqtt"
     number = 1
     image = "mqtt-client"
     options = frozenset({"qos", "retained", "primitive", "reliability", "durability", "queue"})

@@ -23,7 +23,7 @@ _LOCAL, _WAN = "local", "wan"
 
 
 class Ros(ConnectionType):
-    name = "ROS"
+    name, word = "ROS", "ros"
     number = 0
     image = "dds-router"
     options = frozenset({"reliability", "durability", "queue", "rate"})

@@ -21,7 +21,7 @@ from demandops.model.config.config import NODES_FILE, Config, ConfigReader
 
 
 class Zenoh(routes.ConnectionType):
-    name = "ZENOH"
+    name, word = "ZENOH", "zenoh"
     number = 2
     image = "zenoh-bridge"
     options = frozenset({"rate"})

@@ -26,13 +26,13 @@ from demandops.model.ledger.records import Wait
 
 def claims_of(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
     """Return the claims of the request's demand; raise Refused if it holds none."""
-    held = ledger.claims_of_demand(request.demand)
+    held = ledger.claims_with("demand", request.demand)
     if not held:
         demands = sorted(
             {
                 claim.demand
                 for requester in request.own_requesters
-                for claim in ledger.claims_of_requester(requester)
+                for claim in ledger.claims_with("requester", requester)
                 if claim.keeping_override is None
             }
         )
@@ -169,7 +169,7 @@ def join(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Change
         # a put may have chosen this id for its demand, because demand ids are free text
         others = [
             claim
-            for claim in start.claims_of_demand(key.demand)
+            for claim in start.claims_with("demand", key.demand)
             if not claim.joined or {*claim.requesters}.isdisjoint(item.requesters)
         ]
         if others:
@@ -189,7 +189,7 @@ def join(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Change
 def put(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
     # After a put, a demand with an id holds exactly what the put lists.
     start, demand = ledger, request.demand
-    held = ledger.claims_of_demand(demand)
+    held = ledger.claims_with("demand", demand)
     waited = (demand,) * (demand in ledger.waiting)
     # the demand's own claims are no contradiction, because a put may move its own applications
     ledger = others = ledger.without(held)
@@ -226,7 +226,7 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
         subject, who = item.held.subject, ", ".join(sorted(set(item.requesters)))
         mine = [
             claim
-            for claim in ledger.claims_of_demand(demand_id(request.id, item.requesters))
+            for claim in ledger.claims_with("demand", demand_id(request.id, item.requesters))
             if claim.joined
         ]
         listing = _listed_inputs if isinstance(item.held, Application) else _listed_routes
@@ -250,7 +250,7 @@ def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
         ] or [
             f"{claim.subject} for {', '.join(claim.requesters)}"
             for requester in sorted(request.requesters())
-            for claim in ledger.claims_of_requester(requester)
+            for claim in ledger.claims_with("requester", requester)
         ]
         shown = "; ".join(dict.fromkeys(similar[:5])) or "none"
         message = (
@@ -333,14 +333,14 @@ def decommission(  # noqa: PLR0912 - of four kinds
         needing = (c for node in nodes for c in ledger.claims_needing(node))
         claims |= {f"{c.subject} {c.demand}": c for c in needing}
     if "requester" in request.kinds:
-        held = ledger.claims_of_requester(request.id)
+        held = ledger.claims_with("requester", request.id)
         claims |= {f"{c.subject} {c.demand}": c for c in held}
         # a waiting demand that names others too stays, because they can still release it
         demands = ledger.waiting.values()
         waiting = tuple(each.demand for each in demands if each.requesters == (request.id,))
     whole = list[Claim]()
     if "demand" in request.kinds:
-        whole += ledger.claims_of_demand(request.id)
+        whole += ledger.claims_with("demand", request.id)
         waiting += (request.id,) * (request.id in ledger.waiting)
     if "application" in request.kinds:
         whole += ledger.application_claims(request.id)
@@ -515,12 +515,12 @@ def apply(  # noqa: PLR0912 - a case for each operation
         case Restoration():
             return restore(ledger, request, now)
         case Demand(operation="release"):
-            held = ledger.claims_of_demand(demand) if waited else claims_of(ledger, request)
+            held = ledger.claims_with("demand", demand) if waited else claims_of(ledger, request)
             after, keys = ledger.without(held).without_waiting(waited), [c.key for c in held]
             return after, Changes(claims=claim_changes(ledger, after, keys), waiting=waited)
         case Demand(operation="renew"):
             # a demand that waits has no lease yet, but its client may renew it already
-            if waited and not ledger.claims_of_demand(demand):
+            if waited and not ledger.claims_with("demand", demand):
                 return ledger, Changes()
             held = claims_of(ledger, request)
             keys = [claim.key for claim in held]
@@ -529,7 +529,7 @@ def apply(  # noqa: PLR0912 - a case for each operation
                     renewed = claim.lease.started(now, claim.lease)
                     after = after.replace(claim.key, replace(claim, lease=renewed))
         case Demand(operation="expire"):
-            held = ledger.claims_of_demand(demand)
+            held = ledger.claims_with("demand", demand)
             ended = [claim for claim in held if claim.lease and claim.lease.has_ended(now)]
             readers = [c for c in held if c.is_on_application and c.application.read_outputs]
             for claim in ended:  # what reads it ends with it, and may be read itself

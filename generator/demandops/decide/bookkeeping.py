@@ -12,10 +12,9 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quantities import amount_text
-from demandops.decide.placement.capacity import whole_usage
+from demandops.decide.checks.forbidden import whole_usage
 from demandops.decide.planning.overrides import suspended_claims, without_suspended
-from demandops.decide.planning.planner import connection_topics, demanded_inputs, plan
-from demandops.decide.planning.release_keys import all_keys
+from demandops.decide.planning.planner import all_keys, connection_topics, demanded_inputs, plan
 from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.ledger.records import in_turn

@@ -15,7 +15,8 @@ from operator import attrgetter
 from demandops.base.naming import SubjectKind, TopicKey, hash_of, id_problem, topic_problem
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection, Route, RouteKey, faults
-from demandops.connections.connection_types import choose_type, type_named
+from demandops.connections.connection_types import type_named
+from demandops.decide.admission.admission import choose_type
 from demandops.decide.planning.flows import Flow, flows, is_bridged
 from demandops.model.config.config import BROKERS_FILE, Config
 from demandops.model.demand.demand import AnyDemand, Application, Connect, Demand, Item, Operation
@@ -158,7 +159,8 @@ def with_carriers(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDema
         else:
             carriers.items.append(item)
     demanded, notes = list[Item](), dict.fromkeys((*request.notes, *carriers.notes))
-    for item in carriers.united():
+    for each in carriers.items:
+        item = each if isinstance(each, Item) else carriers.united(*each)
         connection = item.held
         if isinstance(connection, Connection):
             # that of a claimed connection stays: with a new broker or node property the choice
@@ -194,17 +196,26 @@ class _Carriers:
     _above: dict[RouteKey, tuple[Connection, Route]] = field(default_factory=dict)
     _standing: dict[str, Connection] = field(default_factory=dict)
 
-    def place(self, item: Item, listed: Connection, index: int, route: Route) -> None:
+    def place(  # noqa: PLR0912, PLR0915 - one story, from the carrier to how it carries the route
+        self, item: Item, listed: Connection, index: int, route: Route
+    ) -> None:
         key, request = listed.key_of(route), self._request
         demand = request.demand or demand_id(request.id, item.requesters)
-        carried = self._carried(key, demand)
-        if carried is None and is_bridged(key, self._config):
+        holding = self._ledger.keys_with("route", *key)
+        own = [each for each in holding if each.demand == demand]
+        current: Route | None = None
+        if not own and key in self._above:
+            carrier, current = self._above[key]
+        elif not own and is_bridged(key, self._config):
             self.notes.append(
                 f"the initial deployment already carries {key.topic} from '{key.sender}' to "
                 f"'{key.receiver}' (bridged in the inventory), so no connection carries it"
             )
             return
-        carrier, current = carried or (listed if listed.id else self._derived(listed, route), None)
+        elif claim := self._ledger.get(min(own or holding, key=_ORDER)) if holding else None:
+            carrier, current = claim.connection, claim.connection.route_of(key)
+        else:
+            carrier = listed if listed.id else self._derived(listed, route)
         header = self._header(carrier.id)
         if header is None:
             wanted = listed if carrier.id == listed.id else carrier
@@ -229,7 +240,14 @@ class _Carriers:
             turned = (key.target, key.topic, True)
         source, target, reverse = turned
         booked_route = replace(booked_route, source=source, target=target, reverse=reverse)
-        differs = _difference(listed, header, self._config)
+        differs, kind = "", header.type
+        if kind and listed.type not in (None, kind):
+            differs = f", by {kind} instead of {listed.type}"
+        elif kind and listed.broker:
+            broker = kind.broker_node(header, self._config)
+            asked = kind.broker_node(replace(listed, type=kind), self._config)
+            if broker != asked:
+                differs = f", at the broker on '{broker}' instead of '{asked}'"
         if is_elsewhere or differs:
             what = f" of connection '{listed.id}'" if item.is_listed else ""
             by = "" if header.id == listed.id else f" by connection '{header.id}'"
@@ -239,20 +257,6 @@ class _Carriers:
             self.items.append((header, demand))
         place = item.places[index] if item.places else f"{item.field}.topics[{index}]"
         self._routes.setdefault((header, demand), []).append((item, place, booked_route))
-
-    def _carried(self, key: RouteKey, demand: str) -> tuple[Connection, Route] | None:
-        holding = self._ledger.keys_with("route", *key)
-        own = [each for each in holding if each.demand == demand]
-        if not own and key in self._above:
-            return self._above[key]
-        if not own and is_bridged(key, self._config):
-            return None
-        for each in sorted(own or holding, key=_ORDER)[:1]:
-            claim = self._ledger.get(each)
-            route = claim.connection.route_of(key) if claim else None
-            if claim and route:
-                return claim.connection, route
-        return None
 
     def _header(self, id: str) -> Connection | None:
         """Return the connection as it stands, without topics; None if the request may shape it."""
@@ -282,29 +286,12 @@ class _Carriers:
                 id = f"derived/{hash_of(json.dumps([kind.word, *key]), 20)}"
         return replace(listed, id=id, type=kind)
 
-    def united(self) -> Iterator[Item]:
-        for each in self.items:
-            if isinstance(each, Item):
-                yield each
-                continue
-            items, places, topics = zip(*self._routes[each], strict=True)
-            own = (item for item in items if item.is_listed and item.held.id == each[0].id)
-            listing = next(own, None)
-            yield replace(
-                listing or items[0],
-                held=replace(each[0], topics=topics),
-                places=places,
-                is_listed=listing is not None,
-            )
-
-
-def _difference(listed: Connection, carrier: Connection, config: Config) -> str:
-    kind = carrier.type
-    if kind is None or listed.type not in (None, kind):
-        return f", by {kind} instead of {listed.type}" if kind else ""
-    broker = kind.broker_node(carrier, config) if listed.broker else ""
-    wanted = kind.broker_node(replace(listed, type=kind), config) if listed.broker else ""
-    return f", at the broker on '{broker}' instead of '{wanted}'" if broker != wanted else ""
+    def united(self, header: Connection, demand: str) -> Item:
+        items, places, topics = zip(*self._routes[header, demand], strict=True)
+        listing = [item for item in items if item.is_listed and item.held.id == header.id]
+        first: Item = (listing or items)[0]
+        held = replace(header, topics=topics)
+        return replace(first, held=held, places=places, is_listed=bool(listing))
 
 
 # ---- a connection that does not suit the others ----
@@ -431,7 +418,7 @@ def without_idle_routes(
         and change.before
         and not change.only_renews
     ):
-        claims = ledger.claims_of_demand(demand)
+        claims = ledger.claims_with("demand", demand)
         needed = {
             (flow.key.sender, *flow.key[2:])
             for claim in claims

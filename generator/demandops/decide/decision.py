@@ -16,7 +16,7 @@ from typing import Literal, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault, suggestion
 from demandops.connections.connection import ClientKey
-from demandops.decide import carriers, changeset, warnings
+from demandops.decide import carriers, warnings
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.completing import (
     completed,
@@ -25,15 +25,22 @@ from demandops.decide.admission.completing import (
     with_separate_instances,
 )
 from demandops.decide.booking import Drain, Restoration, apply, restoration_faults
-from demandops.decide.changeset import Changeset, FileReader, PlannedChange, ReleaseChange
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.forbidden import Difference
-from demandops.decide.placement import capacity, placement, relocation
+from demandops.decide.placement import placement, relocation
 from demandops.decide.placement.candidates import NO_ROOM
 from demandops.decide.planning import flows
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
-from demandops.decide.planning.release_keys import affected_keys
-from demandops.decide.state import State
+from demandops.decide.planning.planner import affected_keys
+from demandops.decide.state import (
+    Changeset,
+    FileReader,
+    PlannedChange,
+    ReleaseChange,
+    State,
+    plan_change,
+    render_change,
+)
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Application, Decommission, Demand, Item
@@ -82,13 +89,8 @@ class Decision:
     # whether waiting demands are tried again: services now request less of a node, or one of the
     # demands shares an application that was booked
     awaited: bool = False
-
-    @property
-    def placed(self) -> tuple[str, ...]:
-        """A sentence for each placed application or service: the chosen node and the reason."""
-        if isinstance(self.request, Drain):
-            return self.request.moved
-        return tuple(dict.fromkeys(text for item in self.request.demanded for text in item.placed))
+    # a sentence for each placed application or service: the chosen node and the reason
+    placed: tuple[str, ...] = ()
 
     @property
     def lease_s(self) -> int | None:
@@ -101,7 +103,9 @@ class Decision:
             leases = (permission.lease_in(domain, put) for domain in domains)
             return min((lease.seconds for lease in leases if lease), default=None)
         claims = (
-            self.state.ledger.claims_of_demand(self.request.demand) if self.request.demand else ()
+            self.state.ledger.claims_with("demand", self.request.demand)
+            if self.request.demand
+            else ()
         )
         claims = claims or tuple(change.after for change in self.changes.claims if change.after)
         return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
@@ -172,7 +176,7 @@ def decide(
             throttled(demand)
             booked = attempt(wait)
         request, changes, after = booked.request, booked.changes, booked.after
-        rendered = changeset.render_change(
+        rendered = render_change(
             booked.planned,
             config,
             state.evaluate,
@@ -188,6 +192,7 @@ def decide(
         for difference in booked.differing:
             notes[difference.warning()] = None
         reasons = (*required_by, *(each.approval_reason() for each in booked.differing))
+        placed = dict.fromkeys(text for item in request.demanded for text in item.placed)
     except OverBudget as spent:
         raise _refused(state, demand, [fault("", str(spent), code="too-large")]) from None
     except (_TooSoon, Refused) as refused:
@@ -216,6 +221,7 @@ def decide(
             if waiting.demand != request.demand
             for subject in waiting.put.subjects()
         ),
+        placed=request.moved if isinstance(request, Drain) else (*placed,),
     )
 
 
@@ -324,7 +330,7 @@ def _wait(
     if demand.operation != "put" or any(each.code != NO_ROOM for each in faults):
         return None
     # a demand that holds claims keeps them when it is refused, so it cannot wait as well
-    if state.ledger.claims_of_demand(demand.demand):
+    if state.ledger.claims_with("demand", demand.demand):
         return None
     if strangers := list(permission.owner_faults(demand, state.ledger, state.config)):
         raise Refused(strangers)
@@ -413,12 +419,12 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
     clashes = clashes or list(collisions.faults_in_files(request, changes, read))
     if clashes:
         raise Refused(clashes)
-    planned = changeset.plan_change(state, after, changes, keys, read, state.plans, checkpoint)
+    planned = plan_change(state, after, changes, keys, read, state.plans, checkpoint)
     differing = [*forbidden.differences(request, state, after, changes.claims, planned.plans)]
     if refused := [difference.fault for difference in differing if difference.is_refused]:
         raise Refused(refused)
-    grown = capacity.growth(planned.former, planned.plans, state.config)
-    refusal = capacity.NoRoom(state.usage(), grown, state.config)
+    grown = forbidden.growth(planned.former, planned.plans, state.config)
+    refusal = forbidden.NoRoom(state.usage(), grown, state.config)
     # a drain was tried on its nodes already, and what releases claims makes room
     if refusal.full and (request.adds_claims or isinstance(request, Restoration)):
         raise refusal

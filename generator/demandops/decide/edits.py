@@ -10,17 +10,13 @@ from itertools import chain
 
 from demandops.base.errors import Fault, Refused
 from demandops.base.naming import Subject
-from demandops.decide import changeset
 from demandops.decide.admission import admission, permission
 from demandops.decide.booking import request_for
-from demandops.decide.changeset import Changeset, FileReader
 from demandops.decide.checks import collisions, forbidden
-from demandops.decide.placement import capacity
-from demandops.decide.placement.capacity import NoRoom
 from demandops.decide.placement.relocation import LedgerUpdate, following_overrides
 from demandops.decide.planning import overrides
-from demandops.decide.planning.release_keys import affected_keys, keys_of_claims
-from demandops.decide.state import State
+from demandops.decide.planning.planner import affected_keys, keys_of_claims
+from demandops.decide.state import Changeset, FileReader, State, plan_change, render_change
 from demandops.model.config.override import Override, format_time
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
@@ -42,9 +38,9 @@ def changeset_of_edit(
 ) -> Changeset:
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
-    planned = changeset.plan_change(old, state, Changes(), keys, read)
+    planned = plan_change(old, state, Changes(), keys, read)
     # a template that takes too long is no fault of the claim, so its release keeps its file
-    return changeset.render_change(planned, state.config, state.evaluate, read, keeps_late=True)
+    return render_change(planned, state.config, state.evaluate, read, keeps_late=True)
 
 
 def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
@@ -73,10 +69,10 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
         faults = list(collisions.name_faults(wanted, before, after, keys, changed, after.names()))
         without = replace(after, ledger=after.ledger.replace(change.key, change.before))
         with suppress(Refused):  # other checks report a claim that cannot be planned
-            grown = capacity.growth_by(without, after, [change])
+            grown = forbidden.growth_by(without, after, [change])
             # only growth is a fault: the nodes may be full because of other claims
             usage = after.usage().plus({need: -amount for need, amount in grown.items()})
-            faults += NoRoom(usage, grown, config).faults
+            faults += forbidden.NoRoom(usage, grown, config).faults
         for each in faults:
             yield each.within(claim_files.path_of(claim.key))
 
@@ -94,19 +90,24 @@ def update_ledger(
     subjects: Iterable[Subject],
     markers: Mapping[str, str],
     now: datetime,
+    *,
+    ending: Iterable[Override] = (),
 ) -> LedgerUpdate:
     """Return the ledger that a change of the configuration requires, and the files to write.
 
     ``subjects`` are those whose claims a person changed. ``markers`` are the ledger's markers of
-    ended overrides, by path.
+    ended overrides, by path. ``ending`` are overrides whose end the generator commits now.
     """
     # An override that is merged after its end never applies. One that was in effect before stays
     # in effect until the generator's own commit ends it.
     in_effect = {override.name: override.end for override in before.overrides}
     expired = [
-        override
-        for override in expired_overrides(after, now)
-        if override.name not in in_effect or in_effect[override.name] != override.end
+        *ending,
+        *(
+            override
+            for override in expired_overrides(after, now)
+            if override.name not in in_effect or in_effect[override.name] != override.end
+        ),
     ]
     stale = records.stale_markers(markers, after.config.overrides)
     ended = {
@@ -140,16 +141,6 @@ def update_claims(
     keys = (*kept, *moved.keys)
     files = changed_claim_files(after.ledger, moved.ledger, keys)
     return replace(moved, keys=keys, files=files)
-
-
-def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
-    if override.end is None:
-        raise ValueError(f"{override.path} has no end")
-    ended = {**world.ledger.ended, override.name: format_time(override.end)}
-    after = replace(world, ledger=replace(world.ledger, ended=ended))
-    update = update_ledger(world, after, (), {}, now)
-    marker = {records.ended_override_path(override.name): records.ended_override_text(override)}
-    return replace(update, files={**update.files, **marker})
 
 
 def changed_claim_files(

@@ -10,8 +10,7 @@ from typing import Literal
 
 from demandops.decide.planning import overrides
 from demandops.decide.planning.overrides import suspended_by
-from demandops.decide.planning.planner import denied_release, plan
-from demandops.decide.planning.release_keys import all_keys, keys_of_claims
+from demandops.decide.planning.planner import all_keys, denied_release, keys_of_claims, plan
 from demandops.model.config.override import Override, format_time
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World

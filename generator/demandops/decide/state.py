@@ -1,31 +1,43 @@
-"""What a decision starts from, the world at one commit, and all that is rendered of it."""
+"""The world at one commit, what a change makes of it, and the files that follow from it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import difflib
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from types import MappingProxyType
+from typing import Any, Literal
 
 from rpds import HashTrieMap
 
-from demandops.base.errors import InvalidInput, OverLimit, Refused
-from demandops.decide import changeset
+from demandops.base.errors import Fault, InvalidInput, OverLimit, Refused, fault
+from demandops.base.quoting import one_line
+from demandops.base.strict_yaml import load_all, short_repr
 from demandops.decide.booking import apply
-from demandops.decide.checks import collisions
+from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.collisions import Names
-from demandops.decide.placement import capacity
-from demandops.decide.placement.capacity import Usage
+from demandops.decide.checks.forbidden import Usage
 from demandops.decide.planning.overrides import apply_effects, effects_on
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
+from demandops.decide.planning.planner import (
+    ReleaseKey,
+    affected_keys,
+    all_keys,
+    keys_of,
+    plan,
+    planned,
+)
 from demandops.model.config.appdef import ApplicationDefinition
 from demandops.model.config.config import Config
+from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.demand.demand import Application, Demand, InputTopic, Item
-from demandops.model.ledger.ledger import ClaimChange, Ledger, World
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
+from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World
 from demandops.model.release import Release, ServiceRelease
 from demandops.render import gitops
+from demandops.render.gitops import path_of
 from demandops.templating.values import Evaluate
 
 
@@ -43,7 +55,7 @@ class State(World):
 
     def usage(self) -> Usage:
         """Return how much the services request; the first call counts all services."""
-        usage = capacity.whole_usage(self) if self._usage is None else self._usage
+        usage = forbidden.whole_usage(self) if self._usage is None else self._usage
         object.__setattr__(self, "_usage", usage)
         return usage
 
@@ -54,7 +66,7 @@ class State(World):
         return names
 
     def followed_by(
-        self, ledger: Ledger, planned: changeset.PlannedChange, usage: Usage, names: Names
+        self, ledger: Ledger, planned: PlannedChange, usage: Usage, names: Names
     ) -> State:
         plans = self.plans
         for key, release in planned.plans.items():
@@ -75,9 +87,208 @@ class State(World):
                 object.__setattr__(state, "_names", names)
         with suppress(Refused):
             if self._usage is not None:
-                usage = self._usage.plus(capacity.growth_by(self, state, changes))
+                usage = self._usage.plus(forbidden.growth_by(self, state, changes))
                 object.__setattr__(state, "_usage", usage)
         return state
+
+
+# ---- the changes that a decision makes: files by path, and how releases change ----
+#
+# A file whose text stays the same is not in the changeset, so an unchanged release needs no commit.
+
+Change = Literal["start", "change", "stop"]
+
+# the order in which lists of changes show them
+CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
+
+# returns the text of a state repo's file, or None if the file is missing
+FileReader = Callable[[str], str | None]
+
+
+# what a change does to the pods of a release; empty if nothing
+Effect = Literal["starts", "restarts", "reconfigures", "stops", ""]
+
+# values of every chart that do not restart the pods that run
+_ALWAYS_LIVE = frozenset({"replicas", "autoscaler"})
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseChange:
+    """A release that starts, changes or stops; ``details`` has a line for each changed fact."""
+
+    name: str
+    what: str
+    file: str
+    change: Change
+    details: tuple[str, ...] = ()
+    effect: Effect = ""
+
+    @property
+    def title(self) -> str:
+        # a sign before it says what starts and what stops
+        effect = f", {self.effect}" if self.change == "change" and self.effect else ""
+        return f"{self.name} ({self.what}){effect}"
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedChange:
+    """What a change of the ledger writes there, and the releases that it may affect."""
+
+    ledger_files: Mapping[str, str | None]
+    # each release that the change may affect, as it is after the change; None if it is gone
+    plans: Mapping[ReleaseKey, Release | None]
+    # the same releases before the change; None if there was none, or if it could not be planned
+    former: Mapping[ReleaseKey, Release | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Changeset:
+    """The files to write and the releases that change. A file whose text is None is removed."""
+
+    files: Mapping[str, str | None]
+    releases: tuple[ReleaseChange, ...]
+    # the paths of the overrides that have an effect on the written files, ``hold`` included
+    overrides: tuple[str, ...] = ()
+    # a warning for each release that a ``hold`` override keeps from changing
+    blocked: tuple[str, ...] = ()
+
+
+def plan_change(
+    before: World,
+    after: World,
+    changes: Changes,
+    keys: Iterable[ReleaseKey],
+    read: FileReader,
+    plans: Mapping[ReleaseKey, Release] = MappingProxyType({}),
+    checkpoint: Callable[[], None] = lambda: None,
+) -> PlannedChange:
+    """Return what follows from a change of the ledger, before any of it is rendered.
+
+    ``keys`` are those of the releases that may differ, and ``plans`` are releases of ``before``
+    that are planned already. ``checkpoint`` may raise an exception to end the work.
+    """
+    files: dict[str, str | None] = {}
+    for change in changes.claims:
+        checkpoint()
+        path = claim_files.path_of(change.key)
+        files[path] = claim_files.text_of(change.after) if change.after else None
+    for demand in changes.waiting:
+        waits = after.ledger.waiting.get(demand)
+        files[records.waiting_path(demand)] = records.waiting_text(waits) if waits else None
+    # before anything is planned, because a claim's file is the smallest of the files that need it
+    _refuse_large(files, after.config.repo_settings.limits.file_bytes, read)
+    now, former = dict[ReleaseKey, Release | None](), dict[ReleaseKey, Release | None]()
+    for key in keys:
+        checkpoint()
+        now[key] = plan(after, key)
+        former[key] = plans.get(key)
+        with suppress(Refused):  # what could not be planned before must not stop its remedy
+            former[key] = former[key] or plan(before, key)
+    return PlannedChange(files, now, former)
+
+
+def render_change(
+    planned: PlannedChange,
+    config: Config,
+    evaluate: Evaluate,
+    read: FileReader,
+    *,
+    keeps_late: bool = False,
+    checkpoint: Callable[[], None] = lambda: None,
+) -> Changeset:
+    """Return the changes in the state repo that follow from a planned change.
+
+    With ``keeps_late``, a release whose values take too long to compute keeps its file, instead of
+    OverLimit.
+    """
+    files = {**planned.ledger_files}
+    releases, shaped, blocked = list[ReleaseChange](), set[str](), list[str]()
+    for key, new in planned.plans.items():
+        checkpoint()
+        old = planned.former[key]
+        old_path = path_of(old) if old else None
+        new_path = path_of(new) if new else None
+        current = read(new_path) if new_path else None
+        try:
+            text = gitops.release_text(new, config, evaluate, current) if new else None
+        except OverLimit:
+            if keeps_late or old == new:  # what only renews a lease needs no template
+                continue
+            raise
+        # the path has the node, so a release that moves to another node leaves a file behind
+        if old_path and old_path != new_path and read(old_path) is not None:
+            files[old_path] = None
+        is_held = new is not None and new.shaping.held and current is not None
+        if new and is_held and (old and old.facts()) != new.facts():
+            by = " and ".join(each.path for each, effects in new.shaping.by if "hold" in effects)
+            blocked.append(f"{new.name} will not change until the 'hold' of {by} ends")
+        if new_path and text != current:
+            files[new_path] = text
+            shaped |= {override.path for override, _ in new.shaping.by} if new else set()
+        if text is not None and text == current:
+            continue
+        if old or new:
+            releases.append(describe_change(old, new, current, text))
+    _refuse_large(files, config.repo_settings.limits.file_bytes, read)
+    releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
+    return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
+
+
+def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
+    faults = []
+    for path, text in files.items():
+        # A file that is too large already may shrink. Else its claims could not be released.
+        # A character has at most four bytes, so most files need not be encoded to be measured.
+        size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
+        if size > max(most, len((read(path) or "").encode()) if size > most else 0):
+            message = (
+                f"would have {size} bytes, but at most {most} are allowed; demand less, or ask a "
+                f"platform engineer to raise limits.fileBytes in {ROOT_FILE}"
+            )
+            faults.append(fault("", message, code="too-large").within(path))
+    if faults:
+        raise Refused(faults)
+
+
+def describe_change(
+    old: Release | None, new: Release | None, current: str | None, text: str | None
+) -> ReleaseChange:
+    """Return how a release changes, and with it its file, from the text ``current`` to ``text``."""
+    release = new or old
+    assert release is not None  # noqa: S101 - a change has at least one side
+    existed = current is not None
+    kind: Change = "stop" if not new else "change" if existed else "start"
+    details: list[str] = []
+    if new and existed:
+        before, after = (
+            [f"{override.path}: {', '.join(effects)}" for override, effects in side.shaping.by]
+            if side
+            else []
+            for side in (old, new)
+        )
+        if not new.shaping.held:  # in a held file, only the comments that name overrides change
+            before = (old.facts() if old else []) + before
+            after = new.facts() + after
+        old_facts, new_facts = frozenset(before), frozenset(after)
+        details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
+        details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
+    effect = _effect(release, current, text)
+    return ReleaseChange(
+        release.name, release.description, path_of(release), kind, tuple(details), effect
+    )
+
+
+def _effect(release: Release, current: str | None, text: str | None) -> Effect:
+    if current is None or text is None:
+        return "stops" if text is None else "starts"
+    (was, before), (now, after) = map(gitops.values_apart, (current, text))
+    if before != after:
+        return "restarts"
+    if was == now:  # only comments differ, which name overrides
+        return ""
+    live = {*release.service.live, *_ALWAYS_LIVE} if isinstance(release, ServiceRelease) else set()
+    differing = {name for name in {**was, **now} if was.get(name, ABSENT) != now.get(name, ABSENT)}
+    return "reconfigures" if differing <= live else "restarts"
 
 
 # ---- all generated files of a state ----
@@ -191,3 +402,142 @@ def try_configuration(state: State) -> None:
         only_late = all(isinstance(error, OverLimit) for error in errors)
         faults = dict.fromkeys(fault for error in errors for fault in error.faults)
         raise (OverLimit if only_late else InvalidInput)(faults)
+
+
+# ---- the releases and files that differ between two commits, or before and after a merge ----
+#
+# A demand's changeset covers only the releases that the demand touches. A change of the
+# configuration may affect any release, so this module compares all. The functions here are pure.
+
+_MOST_FACTS = 20
+
+# marks a missing value, because None is a value of YAML
+ABSENT = object()
+
+
+@dataclass(frozen=True, slots=True)
+class FileChange:
+    """The text of a generated file before and after a change; None if there is no such file."""
+
+    path: str
+    before: str | None
+    after: str | None
+
+    @property
+    def change(self) -> Literal["added", "changed", "removed"]:
+        if self.before is None:
+            return "added"
+        return "removed" if self.after is None else "changed"
+
+    def diff(self) -> Iterator[str]:
+        return difflib.unified_diff(
+            (self.before or "").splitlines(),
+            (self.after or "").splitlines(),
+            self.path if self.before is not None else "/dev/null",
+            self.path if self.after is not None else "/dev/null",
+            lineterm="",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class MergePreview:
+    releases: tuple[ReleaseChange, ...]
+    files: tuple[FileChange, ...]
+    # the paths of the changed files that belong to no release
+    other_files: tuple[str, ...]
+
+
+def planned_releases(world: World) -> dict[ReleaseKey, Release]:
+    return {key: each for key, each in planned(world, all_keys(world)).items() if each}
+
+
+def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()) -> list[Fault]:
+    """Return the faults because of which releases cannot be planned or rendered.
+
+    A fault's file is the first of these that exists: a file in ``edited`` with a claim that needs
+    the release; the file that the fault names; the file of the first claim that needs the release.
+    """
+    errors: list[tuple[ReleaseKey, InvalidInput]] = []
+    for key in all_keys(world):
+        try:
+            if release := plan(world, key):
+                gitops.render(release, world.config, evaluate)
+        except InvalidInput as error:
+            errors.append((key, error))
+    if not errors:
+        return []
+    files: dict[ReleaseKey, list[str]] = {}
+    for subject in sorted(world.ledger.claims, key=str):
+        paths = [claim_files.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
+        for key in keys_of(world, subject):
+            files.setdefault(key, []).extend(paths)
+    faults: list[Fault] = []
+    for key, failure in errors:
+        claims = files.get(key, [])
+        edited_claim = next((path for path in claims if path in edited), "")
+        first = next(iter(claims), "")
+        faults += [fault.within(edited_claim or fault.file or first) for fault in failure.faults]
+    return list(dict.fromkeys(faults))
+
+
+def preview(
+    old: Mapping[ReleaseKey, Release],
+    new: Mapping[ReleaseKey, Release],
+    current: Mapping[str, str],
+    files: Mapping[str, str],
+) -> MergePreview:
+    """Return what a merge changes; ``current`` and ``files`` are the texts before and after it."""
+    file_changes = tuple(
+        FileChange(path, current.get(path), files.get(path))
+        for path in sorted({*current, *files})
+        if current.get(path) != files.get(path)
+    )
+    changed = {change.path for change in file_changes}
+    of_releases = set[str]()
+    releases = []
+    # a release whose key changes is paired with the former release of the same name
+    gone = {release.name: release for key, release in old.items() if key not in new}
+    pairs: list[tuple[Release | None, Release | None]] = [
+        (old.get(key) or gone.pop(release.name, None), release) for key, release in new.items()
+    ]
+    pairs += [(release, None) for release in gone.values()]
+    for before, after in pairs:
+        old_path, new_path = (path_of(side) if side else "" for side in (before, after))
+        # the files decide whether a release differs, because the clusters follow the files
+        if not changed & {old_path, new_path}:
+            continue
+        of_releases |= {old_path, new_path}
+        text = current.get(old_path or new_path)
+        change = describe_change(before, after, text, files.get(new_path))
+        if change.change == "change" and old_path and old_path != new_path:
+            moved = (f"- {old_path}", f"+ {new_path}")
+            change = replace(change, details=(*moved, *change.details))
+        elif change.change == "change" and not change.details:
+            with suppress(InvalidInput):
+                was, now = list(load_all(text or "")), list(load_all(files.get(new_path, "")))
+                differing = list(leaf_differences(was, now))
+                facts = []
+                for path, *sides in differing[:_MOST_FACTS]:
+                    shown = ("none" if side is ABSENT else short_repr(side) for side in sides)
+                    facts.append(f"{path.removeprefix('[0].')}: {' → '.join(shown)}")
+                if len(differing) > _MOST_FACTS:
+                    facts.append(f"and {len(differing) - _MOST_FACTS} more")
+                change = replace(change, details=tuple(facts))
+        releases.append(change)
+    releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
+    others = tuple(sorted(changed - of_releases))
+    return MergePreview(tuple(releases), file_changes, others)
+
+
+def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
+    """Yield (path, old, new) for each smallest part that differs; :data:`ABSENT` if missing."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in dict.fromkeys([*old, *new]):
+            inner = f"{path}.{key}" if path else str(key)
+            yield from leaf_differences(old.get(key, ABSENT), new.get(key, ABSENT), inner)
+    # lists of different lengths are one part: it is not known which of their items is new
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for index, (left, right) in enumerate(zip(old, new, strict=True)):
+            yield from leaf_differences(left, right, f"{path}[{index}]")
+    elif type(old) is not type(new) or old != new:  # Python treats 1, 1.0 and True as equal
+        yield path, old, new

@@ -23,7 +23,7 @@ from demandops.decide.placement.candidates import lacks, requirement_of, unmet
 from demandops.decide.placement.relocation import following_overrides, with_moves
 from demandops.decide.planning.flows import flows_without_carrier, topics_of_origin
 from demandops.decide.planning.overrides import without_suspended
-from demandops.decide.planning.release_keys import claims_needing
+from demandops.decide.planning.planner import claims_needing
 from demandops.decide.state import State
 from demandops.model.config.appdef import ignored_fields
 from demandops.model.config.base_model import matches

@@ -215,7 +215,10 @@ def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> di
         "outputs": dict(release.outputs),
         "parameters": dict(release.parameters),
         "requests": release.service.pod_requests,
-        "images": {name: release.image(name, config).parts() for name in release.service.images},
+        "images": {
+            name: {part: value or "" for part, value in release.image(name, config)}
+            for name in release.service.images
+        },
     }
     # Never both. A template that knows only ``replicas`` must fail, because the GitOps controller
     # would set back what the autoscaler writes.

@@ -17,8 +17,7 @@ from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import with_lines
 from demandops.decide.booking import Restoration
-from demandops.decide.changeset import FileReader
-from demandops.decide.state import rendered_files
+from demandops.decide.state import FileReader, rendered_files
 from demandops.model.config.config import Config
 from demandops.model.config.override import OVERRIDES_ROOT, override_selects
 from demandops.model.demand.demand import Rollback

@@ -17,10 +17,9 @@ from demandops.base.errors import InvalidInput, StateRepoError, fault
 from demandops.base.runtime import REAL
 from demandops.base.settings import LEDGER_API_VERSION, RENDER_VERSION, REPORTS_ROOT
 from demandops.decide.carriers import with_one_carrier
-from demandops.decide.changeset import planned_releases
 from demandops.decide.edits import changed_claim_files, faults_of_edit, update_ledger
 from demandops.decide.planning.flows import with_booked_topics_marked
-from demandops.decide.state import State
+from demandops.decide.state import State, planned_releases
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.load import load

@@ -15,8 +15,7 @@ from demandops.base.settings import (
     RENDER_VERSION,
     REPORTS_ROOT,
 )
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
+from demandops.decide.planning.planner import ReleaseKey, affected_keys, all_keys, plan
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.repo_settings import ROOT_FILE

@@ -21,9 +21,8 @@ from demandops.base.quoting import harmless, one_line
 from demandops.base.runtime import Runtime, Thread
 from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.admission import permission
-from demandops.decide.changeset import FileReader
 from demandops.decide.decision import Decision, admit, decide
-from demandops.decide.state import State
+from demandops.decide.state import FileReader, State
 from demandops.model.config.config import Config
 from demandops.model.config.repo_settings import Proposals
 from demandops.model.demand.demand import Demand

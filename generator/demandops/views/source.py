@@ -31,10 +31,16 @@ from demandops.cluster.rollouts import (
 )
 from demandops.cluster.watches import ObjectCache
 from demandops.decide.override_report import Entry, override_report, override_state
-from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
-from demandops.decide.planning.planner import denied_release, plan
-from demandops.decide.planning.release_keys import ReleaseKey, takes
+from demandops.decide.planning.planner import (
+    ReleaseKey,
+    affected_keys,
+    all_keys,
+    denied_release,
+    keys_of_claims,
+    plan,
+    takes,
+)
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.inventory import Node
@@ -169,12 +175,12 @@ class Source:
         differing = subject_before.keys() ^ subject_now.keys()
         subjects = [*dict.fromkeys(subject_before.get(id) or subject_now[id] for id in differing)]
         changes = changes_on(old.ledger, new.ledger, subjects)
-        keys: set[ReleaseKey] = {*release_keys.affected_keys(old, new, changes)}
+        keys: set[ReleaseKey] = {*affected_keys(old, new, changes)}
         for was, now in ((change.before, change.after) for change in changes):
             # the views show requesters, but `affected_keys` omits a release whose file stays the
             # same although its requesters changed
             if was and now and was.requesters != now.requesters:
-                keys.update(release_keys.keys_of_claims(self.active, [now]))
+                keys.update(keys_of_claims(self.active, [now]))
         # what is planned as before may be needed by other claims
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
@@ -241,7 +247,7 @@ class Source:
     def planned(self) -> dict[ReleaseKey, Planned | None]:
         # None if the release is denied, if all claims that need it are suspended, or if the client
         # of a connection carries no topic
-        return {key: self._plan(key) for key in release_keys.all_keys(self.state)}
+        return {key: self._plan(key) for key in all_keys(self.state)}
 
     @_Derived
     def running(self) -> list[Planned]:

@@ -14,7 +14,6 @@ from urllib.parse import parse_qs, urlparse
 
 import pytest
 from demandops.serve import proposal
-from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.http import Answer, Call, serving
@@ -82,80 +81,53 @@ def petra(hub: Hub, petra: Person, tmp_path: Path, monkeypatch: pytest.MonkeyPat
     return petra
 
 
-def test_a_pull_request_is_opened_and_its_link_told(
+def visit(vehicle: str) -> Any:
+    return goals.put("visit", "user", topic=(f"/vehicles/{vehicle}/ego_data", vehicle))
+
+
+def test_a_pull_request_is_opened_and_closed_for_the_one_that_replaces_it(
     hub: Hub, url: str, bare: Path, petra: Person
 ) -> None:
-    with rig.running(url) as generator:
-        proposed = Proposed(generator, goal(1))
-        branch = proposed.branch
-        [pull] = hub.pulls
-        assert f"{branch} {pull['html_url']} (required by" in proposed.told[-1][1]
-        assert (pull["head"], pull["base"]) == (branch, "main")
-        assert pull["title"] == (
-            "Join edge/fusion-1, vehicle01/edge, "
-            "derived/station00/edge/stations/station00/pointcloud"
-        )
-        assert "This demand needs approval, as required by ` access domain" in pull["body"]
-        petra.merge(branch)
-        assert proposed.outcome() == "booked"
-    assert [one["state"] for one in hub.pulls] == ["open"], "the generator must not merge"
-
-
-def test_a_changed_demand_is_a_new_pull_request_and_the_old_one_is_closed_and_names_it(
-    hub: Hub, url: str, bare: Path, petra: Person
-) -> None:
-    def visit(vehicle: str) -> Any:
-        return goals.put("visit", "user", topic=(f"/vehicles/{vehicle}/ego_data", vehicle))
-
     with rig.running(url) as generator:
         first = Proposed(generator, visit("vehicle01"))
         seen = f"{first.branch} {git(bare, 'rev-parse', first.branch)}"
+        [pull] = hub.pulls
+        assert f"{first.branch} {pull['html_url']} (required by" in first.told[-1][1]
+        assert (pull["head"], pull["base"]) == (first.branch, "main")
+        assert pull["title"] == "Put edge/visit, derived/vehicle01/edge/vehicles/vehicle01/ego_data"
+        assert "This demand needs approval, as required by ` access domain" in pull["body"]
         second = Proposed(generator, visit("vehicle02"))
-        assert f"{second.branch} " in second.told[-1][1]
-        rig.wait_until(lambda: hub.pulls[0]["state"] == "closed", "the old one is closed")
-        old, new = hub.pulls
-        assert (old["head"], new["head"]) == (first.branch, second.branch)
-        assert second.branch in old["body"].splitlines()[0]
-        assert old["body"].endswith("```\n"), "the text is kept"
+        assert f"{second.branch} https://github.com/its/state/pull/2 " in second.told[-1][1]
+        rig.wait_until(lambda: pull["state"] == "closed", "the old one is closed")
+        assert second.branch in pull["body"].splitlines()[0]
+        assert pull["body"].endswith("```\n"), "the text is kept"
         changed = f"This has changed: it replaces {seen}, and no approval of that counts here. "
-        assert new["body"].startswith(changed)
-        assert "https://github.com/its/state/pull/2 " in second.told[-1][1]
+        assert hub.pulls[1]["body"].startswith(changed)
+        petra.merge(second.branch)
+        assert second.outcome() == "booked"
+    assert hub.pulls[1]["state"] == "open", "the generator must not merge"
 
 
-@pytest.mark.parametrize("runs", [True, False])
+@pytest.mark.parametrize("when", ["while it runs", "before a restart", "withdrawn"])
 def test_a_closed_pull_request_turns_the_demand_down_and_is_not_opened_again(
-    hub: Hub, bare: Path, petra: Person, runs: bool
+    hub: Hub, bare: Path, petra: Person, when: str
 ) -> None:
     with rig.running(bare) as generator:
-        proposed = Proposed(generator, goal(1))
+        proposed = Proposed(generator, goal(1), "op-1")
         assert [proposed.branch] == branches(bare)
-        if runs:
+        if when == "withdrawn":
+            assert generator.withdraw("op-1")
+            assert proposed.outcome() == "Withdrawn"
+            rig.wait_until(lambda: hub.pulls[0]["state"] == "closed", "it is closed")
+        if when == "while it runs":
             hub.pulls[0]["state"] = "closed"
             assert proposed.outcome() == "TurnedDown"
             assert "/pull/1 was closed" in str(proposed.ticket.future.exception())
-    hub.pulls[0]["state"] = "closed"
-    with rig.running(bare):
+    with rig.running(bare) as generator:
+        assert len(hub.pulls) == 1, "a restart must open no second one"
+        hub.pulls[0]["state"] = "closed"
         rig.wait_until(lambda: branches(bare) == [], "the demand is turned down")
     assert len(hub.pulls) == 1
-
-
-def test_a_restart_opens_no_second_one(hub: Hub, bare: Path, petra: Person) -> None:
-    with rig.running(bare) as generator:
-        branch = Proposed(generator, goal(1)).branch
-    with rig.running(bare) as generator:
-        assert Proposed(generator, goal(2)).branch != branch
-    assert [pull["head"] for pull in hub.pulls].count(branch) == 1
-
-
-def test_withdrawing_a_demand_closes_its_pull_request(
-    hub: Hub, bare: Path, petra: Person, generator: Generator
-) -> None:
-    proposed = Proposed(generator, goal(1), "op-1")
-    assert [proposed.branch] == branches(bare)
-    assert generator.withdraw("op-1")
-    assert proposed.outcome() == "Withdrawn"
-    assert branches(bare) == []
-    rig.wait_until(lambda: hub.pulls[0]["state"] == "closed", "the pull request is closed")
 
 
 def test_a_forge_that_is_away_holds_nothing_up_and_is_asked_again(

@@ -6,13 +6,15 @@ After a restart the same is in effect, and every commit verifies by its trailers
 from __future__ import annotations
 
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import pygit2
 import pytest
 import yaml
-from demandops.base.errors import InvalidInput, Refused, StateRepoError
+from demandops.base.errors import DemandOpsError, InvalidInput, Refused, StateRepoError
 from demandops.base.settings import GENERATED_ROOTS
 from demandops.repo import reader
 from demandops.repo.history import commit_log
@@ -22,7 +24,7 @@ from demandops.serve.generator import Generator
 from tests.kit import rig
 from tests.kit.chance import IN_FULL
 from tests.kit.config import override
-from tests.kit.repo import FORGER, differing
+from tests.kit.repo import FORGER, GitRepo, differing
 from tests.kit.repo import read as text
 from tests.kit.rig import Person, goal, leave
 
@@ -45,14 +47,32 @@ def tagged(bare: Path, new: str, kind: str = "Images") -> str:
     return yaml.safe_dump(images)
 
 
+def effects() -> list[dict[str, Any]]:
+    """Return the fields of overrides, each with another effect; one is not valid."""
+    fusion, links = {"services": ["object-fusion"]}, {"connections": ["*"]}
+    detection = {"services": ["object-detection"]}
+    return [
+        {"select": fusion, "hold": True, "priority": 5},
+        {"select": {"applications": ["edge/*"], "requesters": ["user1", "user5"]}, "keep": True},
+        {"select": links, "keep": True},
+        {"select": {"requesters": ["user2"]}, "deny": True},
+        {"select": detection, "deny": True},
+        {"select": {"nodes": ["edge"]}, "values": {"tolerations": []}},
+        {"select": {"applications": ["edge/fusion-2"]}, "node": "cloud", "priority": 7},
+        {"select": links, "images": {"mqtt-client": {"tag": "t"}}, "priority": 9},
+        {"select": detection, "replicas": "many"},
+    ]
+
+
 def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
     """Return a random change that is valid, breaks a file, or removes what demands need."""
     start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
     claim = random.choice([path for path in rig.claims(bare) if "applications" in path])
+    number, fields = random.choice([*enumerate(effects())])
+    name, select = f"overrides/{number}.yaml", fields.pop("select")
     changes: list[dict[str, str | None]] = [
-        {"overrides/two.yaml": TWO.replace("replicas: 2", f"replicas: {random.randint(2, 9)}")},
-        {"overrides/broken.yaml": BROKEN},
-        {"overrides/broken.yaml": BROKEN.replace("many", "3")},
+        {name: override(select, **fields)},
+        {name: None} if text(bare, name) else {"README.md": "Ours\n"},
         {IMAGES: tagged(bare, f"v{random.randint(1, 9)}")},
         {IMAGES: tagged(bare, "v1", "Imags")},
         {NODES: nodes[:start] + nodes[end:]},
@@ -61,9 +81,11 @@ def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
         {claim: text(bare, claim).replace("node: edge\n", "node: nowhere\n")},
         {claim: None},
     ]
-    first, second = random.sample(changes[:7], 2)
-    chosen = first | second if random.random() < 0.3 else random.choice(changes)
-    return {**chosen, "README.md": str(random.random())}
+    first, second = random.sample(changes[:6], 2)
+    chosen = (
+        first | second if random.random() < 0.3 else random.choice([*changes[:1] * 4, *changes])
+    )
+    return {**chosen, "notes.md": str(random.random())}
 
 
 STYLES: dict[str, list[str]] = {
@@ -196,7 +218,7 @@ def test_a_start_at_any_commit_finds_what_the_running_generator_has(
     with rig.running(bare) as generator:
         rig.book(generator, *(goal(number) for number in range(6)))
         repo = pygit2.Repository(str(bare))
-        for _ in range(10):
+        for _ in range(15):
             files = _change(random, bare, nodes)
             made = person.change(files)
             alone = snapshots.state_at(repo, made)
@@ -210,6 +232,15 @@ def test_a_start_at_any_commit_finds_what_the_running_generator_has(
                     c.key: c for c in running.state.ledger
                 }, files
             assert bool(alone.problems) == bool(running.problems)
+            with suppress(DemandOpsError):
+                rig.book(generator, goal(random.randrange(8), shutdown=random.random() < 0.4))
+        gone = dict.fromkeys(GitRepo(bare).files("overrides/"))
+        person.change({NODES: nodes, IMAGES: tagged(bare, "v1"), **gone})
+        rig.book(generator, goal(9))
+        assert generator.snapshot.problems == ()
+    left = GitRepo(bare).files()
+    assert not [path for path in left if path.startswith(("overrides/", "ledger/overrides/"))]
+    assert not [path for path, one in left.items() if "# override " in one or "override:" in one]
     rig.assert_sound(bare)
 
 

@@ -98,17 +98,6 @@ class _Broken:
         return getattr(self._repo, name)
 
 
-def test_a_lock_that_is_no_file_is_told_and_not_waited_for_in_silence(bare: Path) -> None:
-    with rig.running(bare) as generator:
-        stages = Stages()
-        lock = bare / "refs" / "heads" / "main.lock"
-        lock.mkdir()
-        generator.submit(goal(1), listener=stages)
-        rig.wait_until(lambda: "away" in stages.names, "the requester is told", 20)
-        lock.rmdir()
-    rig.assert_sound(bare)
-
-
 # ---- a tip that cannot be read ----
 
 
@@ -168,51 +157,45 @@ def test_a_commit_that_cannot_be_read_is_told_and_refused_at_a_push(
     push = ("push", "--quiet", str(bare), "main:main")
     with pytest.raises(AssertionError, match=f"object {made}: missingEmail"):
         git(clone, *push)
+    git(bare, "config", "receive.fsckObjects", "false")  # Git's default
     with rig.running(bare) as generator:
-        good = tip(bare)
-        git(bare, "config", "receive.fsckObjects", "false")  # Git's default
         git(clone, *push)
         with pytest.raises(StateRepoError, match=f"commit {made}: .*; set the branch back"):
             rig.receipt(generator.submit(goal(1)))
-        git(bare, "update-ref", "refs/heads/main", good)
-        rig.book(generator, goal(2))
+
+
+def _at(time: int) -> bytes:
+    return b"Petra <petra@example.org> %d +0000" % time
 
 
 @pytest.mark.parametrize(
-    ("who", "encoding"), [(PETRA, b"nonsense-7"), (LATIN_1, b"ISO-8859-1"), (LATIN_1, b"")]
+    ("who", "encoding", "name"),
+    [
+        (PETRA, b"nonsense-7", b""),
+        (LATIN_1, b"ISO-8859-1", b""),
+        (LATIN_1, b"", b""),
+        (_at(-62_000_000_000), b"", b"a.yaml"),
+        (_at(254_000_000_000), b"", b"a.yaml"),
+        (_at(2**62), b"", b"a.yaml"),
+        (PETRA, b"", b"\xff.yaml"),
+    ],
 )
-def test_a_commit_in_an_unknown_encoding_is_like_any_other(
-    bare: Path, who: bytes, encoding: bytes
+def test_a_commit_of_an_odd_encoding_or_time_is_like_any_other(
+    bare: Path, who: bytes, encoding: bytes, name: bytes
 ) -> None:
+    """What it holds that is not valid, like a file of an odd name, is held back alone."""
+    tree = _with_entry_in_overrides(bare, name) if name else None
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
-        _commit_by_hand(bare, who, more=b"encoding %s\n" % encoding if encoding else b"")
+        _commit_by_hand(bare, who, tree=tree, more=b"encoding %s\n" % encoding if encoding else b"")
         rig.book(generator, goal(2))
+        held_back = [f"overrides/{name.decode(errors='backslashreplace')}"] if name else []
+        assert [fault.file for fault in generator.snapshot.problems] == held_back
     with rig.running(bare) as generator:
         rig.book(generator, goal(3))
-    assert len(rig.commits(bare)) == 4
-    assert rig.differing(bare) == {}
-
-
-@pytest.mark.parametrize("time", [-62_000_000_000, 254_000_000_000, 2**62])
-def test_a_commit_of_an_impossible_time_holds_back_its_files_alone(bare: Path, time: int) -> None:
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-        who = b"Petra <petra@example.org> %d +0000" % time
-        _commit_by_hand(bare, who, tree=_with_entry_in_overrides(bare, b"a.yaml"))
-        rig.book(generator, goal(2))
-        assert {fault.file for fault in generator.snapshot.problems} == {"overrides/a.yaml"}
     with reader.opened(str(bare)) as opened:
-        assert len(list(opened.log())) == 5
-
-
-def test_a_file_whose_name_is_no_text_holds_back_itself_alone(
-    generator: Generator, bare: Path
-) -> None:
-    rig.book(generator, goal(1))
-    _commit_by_hand(bare, tree=_with_entry_in_overrides(bare, b"\xff.yaml"))
-    rig.book(generator, goal(2))
-    assert {fault.file for fault in generator.snapshot.problems} == {"overrides/\\xff.yaml"}
+        assert len(list(opened.log())) == len(rig.commits(bare)) + 1
+    assert rig.differing(bare) == {}
 
 
 # ---- a damaged clone ----
@@ -229,12 +212,22 @@ def _drop_indexes(clone: Path) -> None:
         index.unlink()
 
 
+def _cut_off(clone: Path) -> None:
+    """Leave a clone as a process that was killed while it made the clone."""
+    for part in ("packed-refs", "refs/remotes/origin/main"):
+        (clone / part).unlink(missing_ok=True)
+    clone.with_name("clone.git.partial").mkdir()
+
+
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "truncated-packs": _truncate_packs,
     "no-indexes": _drop_indexes,
     "broken-head": lambda clone: (clone / "HEAD").write_text("nonsense\n"),
     "empty-config": lambda clone: (clone / "config").write_text(""),
     "no-objects": lambda clone: shutil.rmtree(clone / "objects"),
+    # a living process would have locked the slot
+    "a-lock": lambda clone: (clone / "refs/remotes/origin/main.lock").touch(),
+    "cut-off": _cut_off,
 }
 
 

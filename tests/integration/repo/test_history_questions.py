@@ -37,5 +37,7 @@ def test_a_generator_answers_for_the_past_without_another_clone(url: str, data_h
     with rig.running(url) as generator:
         first, _ = rig.book(generator, rig.goal(1), rig.goal(2))
         ledger = generator.snapshot_at(first.commit).state.ledger
-        assert ledger.claims_of_requester("user1") and not ledger.claims_of_requester("user2")
+        assert ledger.claims_with("requester", "user1") and not ledger.claims_with(
+            "requester", "user2"
+        )
     assert [path.name for path in next(data_home.iterdir()).iterdir()] == ["slot-0"]

@@ -389,10 +389,13 @@ class Story:
             rig.git(self._bare, *command)
 
     def lay(self, files: Mapping[str, str | None]) -> None:
-        """Write or remove files in the folder of the bare repository."""
+        """Write or remove files, or folders, in the folder of the bare repository."""
         for path, text in files.items():
             file = self._bare / path
-            file.unlink() if text is None else file.write_text(text)
+            if path.endswith("/"):
+                file.mkdir() if text is not None else file.rmdir()
+            else:
+                file.write_text(text) if text is not None else file.unlink()
 
     def http(self, faults: Mapping[str, Any]) -> None:
         """Set faults of the smart-HTTP server."""

@@ -27,8 +27,7 @@ from demandops.connections.connection import (
     ConnectionType,
 )
 from demandops.decide.decision import Decision
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import keys_of
+from demandops.decide.planning.planner import keys_of, plan
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.ledger import claim as claim_files
 from demandops.templating import engine
@@ -45,7 +44,7 @@ RELAY_TEMPLATES = Path(__file__).parent / "relay"
 class RelayType(ConnectionType):
     """A connection type with one client at the target, for the topics of all its connections."""
 
-    name = "RELAY"
+    name, word = "RELAY", "relay"
     number = 7
     image = "relay"
     options = frozenset({"queue"})

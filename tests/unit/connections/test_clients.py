@@ -15,7 +15,7 @@ from demandops.base.errors import Refused
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections.connection import ClientKey, Route
 from demandops.connections.zenoh import ZENOH
-from demandops.decide.planning.release_keys import affected_keys
+from demandops.decide.planning.planner import affected_keys
 from demandops.decide.state import State, rendered_files
 from demandops.model.ledger.ledger import changes_on
 

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from demandops.base.errors import Refused
 from demandops.base.quantities import amount_of, amount_text
+from demandops.decide.checks.forbidden import whole_usage
 from demandops.decide.decision import Decision
-from demandops.decide.placement.capacity import whole_usage
 from demandops.decide.state import State
 from demandops.model.config.load import load
 from demandops.model.ledger.ledger import ClaimChange
@@ -130,7 +130,7 @@ def test_no_node_gets_more_than_it_has_and_what_waits_does_not_fit_and_is_booked
         assert not waiting or when_full == "wait"
         for one in waiting:
             assert one.put.goal == sent[one.demand]
-            assert not repo.state.ledger.claims_of_demand(one.demand)
+            assert not repo.state.ledger.claims_with("demand", one.demand)
             assert repo.decide(one.put).outcome == "waiting"
         turns = [(-one.put.priority, one.since) for one in waiting]
         assert turns == sorted(turns)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decide.changeset import ReleaseChange, describe_change, planned_releases
+from demandops.decide.state import ReleaseChange, describe_change, planned_releases
 from demandops.render import gitops
 
 from tests.kit.config import edited, override, skeleton

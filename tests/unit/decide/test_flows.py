@@ -17,8 +17,7 @@ import yaml
 from demandops.base.errors import Refused
 from demandops.decide.edits import changed_claim_files
 from demandops.decide.placement.relocation import following_overrides
-from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, all_keys
+from demandops.decide.planning.planner import ReleaseKey, affected_keys, all_keys, plan
 from demandops.decide.state import rendered_files
 from demandops.decide.warnings import policy_warnings
 from demandops.model.config.config import Config

@@ -15,7 +15,7 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     books = MemoryRepo()
     decision = books.decide(put("d", lease=60))
     ledger = books.decide(replace(decision.request, awaits_approval=True)).state.ledger
-    claims = ledger.claims_of_demand("d")
+    claims = ledger.claims_with("demand", "d")
     claim = next(one for one in claims if one.is_on_application)
     assert claim.lease is not None
     assert claim.lease.until == UNSTARTED

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 from demandops.base.errors import fault
-from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision
+from demandops.decide.state import ReleaseChange
 from demandops.model.demand.demand import Decommission
 from demandops.repo.history import commit_message
 

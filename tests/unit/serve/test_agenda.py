@@ -263,7 +263,7 @@ def test_it_looks_again_when_the_first_lease_ends(clock: Clock, expiry: Agenda) 
 def test_an_end_that_moves_within_its_minute_is_seen(expiry: Agenda) -> None:
     ledger = leased(("a", 50, 0), ("b", 55, 0))
     assert leases_in(expiry, ledger) == pytest.approx(50, abs=0.1)
-    (claim,) = ledger.claims_of_demand("b")
+    (claim,) = ledger.claims_with("demand", "b")
     sooner = replace(claim, lease=Lease(20, 0, NOW + timedelta(seconds=20)))
     ledger = ledger.replace(claim.key, sooner)
     assert leases_in(expiry, ledger) == pytest.approx(20, abs=0.1)

@@ -13,7 +13,7 @@ from demandops.base.quoting import lines, one_line
 from demandops.cli.formats import output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.queries.commits import entry_lines, release_lines
-from demandops.decide.changeset import FileChange
+from demandops.decide.state import FileChange
 from demandops.repo.merge_check import merge_check
 from demandops.repo.merge_check.merge_check import CheckResult
 from demandops.repo.merge_check.rendered_charts import MISSING, NO_HELM, RenderedCharts

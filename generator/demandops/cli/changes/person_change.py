@@ -27,16 +27,16 @@ from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import formats, target
 from demandops.cli.output import done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.commits import differences, entry_lines, release_lines
-from demandops.decide.changeset import (
+from demandops.decide.planning.overrides import suspended_claims
+from demandops.decide.planning.planner import ReleaseKey
+from demandops.decide.state import (
     FileChange,
     FileReader,
     ReleaseChange,
+    State,
     describe_change,
     planned_releases,
 )
-from demandops.decide.planning.overrides import suspended_claims
-from demandops.decide.planning.release_keys import ReleaseKey
-from demandops.decide.state import State
 from demandops.model.ledger.claim import requesters_of
 from demandops.model.release import Release, ServiceRelease, claims_of
 from demandops.render import gitops

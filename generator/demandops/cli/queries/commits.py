@@ -24,7 +24,7 @@ from demandops.cli.output import SIGNS, at_option, busy, errors, progress
 from demandops.cli.target import name_options, state_repo_option
 from demandops.decide.bookkeeping import EntryChange, as_data, bookkeeping_changes
 from demandops.decide.bookkeeping import bookkeeping as derive
-from demandops.decide.changeset import MergePreview, ReleaseChange, planned_releases, preview
+from demandops.decide.state import MergePreview, ReleaseChange, planned_releases, preview
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
 from demandops.repo.history import commit_log

@@ -6,24 +6,25 @@ check what the policy allows (:mod:`.permission`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 
-from demandops.base.errors import Fault, fault, suggestion
+from demandops.base.errors import Fault, fault, sentences, suggestion
 from demandops.base.naming import id_problem, topic_problem
 from demandops.base.quoting import quoted
 from demandops.connections import connection as routes
 from demandops.connections import connection_types
-from demandops.connections.connection import Connection
+from demandops.connections.connection import UNSUPPORTED, Connection, ConnectionType
 from demandops.model.config.appdef import ApplicationDefinition, Services
 from demandops.model.config.config import (
     CHARTS_FILE,
     DOMAINS_FILE,
+    IMAGES_FILE,
     NODES_FILE,
     VERSIONS_FILE,
     Config,
 )
-from demandops.model.demand.demand import LONGEST_S, Application, Connect, Delivery, Demand
+from demandops.model.demand.demand import LONGEST_S, Application, Delivery, Demand
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
 
@@ -66,14 +67,21 @@ def faults(request: Demand, config: Config) -> Iterator[Fault]:
                 yield item.fault(each.field, each.message, code=each.code)
 
 
-def _application_faults(app: Application, config: Config, claiming: bool) -> Iterator[Fault]:
+def _application_faults(  # noqa: PLR0912 - a branch for each fault
+    app: Application, config: Config, claiming: bool
+) -> Iterator[Fault]:
     inputs = [
         (f"inputs.{role}[{position}]", topic)
         for role, topics in app.inputs.items()
         for position, topic in enumerate(topics)
         if not topic.application  # its faults are those of the application whose output it is
     ]
-    yield from _connect_faults(app.connect)
+    if app.connect.broker:
+        yield from _id_faults("connect.broker", app.connect.broker)
+        if app.connect.type not in ("auto", "none"):
+            kind = connection_types.type_named(app.connect.type)
+            if not kind.takes_broker:
+                yield _broker_fault("connect.broker", kind)
     # a shutdown may leave out nodes and sources, because it lists what is booked already
     if claiming or app.node:
         yield from _id_faults("node", app.node)
@@ -106,15 +114,6 @@ def _application_faults(app: Application, config: Config, claiming: bool) -> Ite
     if appdef is not None and not any(app.inputs.values()):
         roles = " or ".join(sorted(appdef.inputs))
         yield fault("inputs", f"is empty; list at least one topic of {roles}")
-
-
-def _connect_faults(connect: Connect) -> Iterator[Fault]:
-    if connect.broker:
-        yield from _id_faults("connect.broker", connect.broker)
-        if connect.type not in ("auto", "none"):
-            kind = connection_types.type_named(connect.type)
-            if not kind.takes_broker:
-                yield connection_types.broker_fault("connect.broker", kind)
 
 
 def _delivery_faults(where: str, delivery: Delivery, services: Services) -> Iterator[Fault]:
@@ -231,11 +230,12 @@ def _connection_faults(connection: Connection, config: Config, claiming: bool) -
     for end, node in ends.items():
         yield from _node_faults(end, node, config)
     if connection.type is not None:
-        yield from connection_types.type_faults(connection.type, connection, config)
-    elif all(node in config.nodes for node in connection.nodes) and (
-        connection_types.choose_type(connection, config) is None
+        yield from _type_faults(connection.type, connection, config)
+    elif (
+        all(node in config.nodes for node in connection.nodes)
+        and choose_type(connection, config) is None
     ):
-        yield connection_types.no_type_fault(connection, config)
+        yield _no_type_fault(connection, config)
 
 
 def _node_faults(where: str, node: str, config: Config) -> Iterator[Fault]:
@@ -264,3 +264,88 @@ def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
         yield from _id_faults(f"requesters[{index}]", requester)
     if not requesters:
         yield fault("requesters", "is empty; list at least one requester")
+
+
+# ---- types of connections: whether one can carry a connection, and the first that can ----
+
+
+def _named(kinds: Iterable[ConnectionType]) -> str:  # `MQTT or ROS`
+    return " or ".join(kind.name for kind in kinds)
+
+
+# Every type supports these options
+_ALWAYS = ("type", "reverse")
+
+
+def choose_type(connection: Connection, config: Config) -> ConnectionType | None:
+    fitting = (
+        kind
+        for kind in connection_types.CONNECTION_TYPES
+        if not any(_type_faults(kind, connection, config))
+    )
+    return next(fitting, None)
+
+
+def _no_type_fault(connection: Connection, config: Config) -> Fault:
+    reasons = []
+    for kind in connection_types.CONNECTION_TYPES:
+        reason = next(_type_faults(kind, connection, config))
+        field = "" if reason.field in ("type", "broker") else f"{reason.field} "
+        text = f"{field}{reason.message}"
+        reasons.append(text if text.startswith(kind.name) else f"{kind.name}: {text}")
+    message = f"no connection type is given, and none fits. {sentences(reasons)}"
+    return fault("type", message, code=UNSUPPORTED)
+
+
+def _type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
+    kinds = connection_types.CONNECTION_TYPES
+    ends = {"source": connection.source, "target": connection.target}
+    # unknown ones are reported elsewhere
+    are_known = all(node in config.nodes for node in ends.values())
+    if kind.image not in config.images:
+        message = f"{kind.name} needs an image '{kind.image}'; add it to "
+        message += config.place_of(IMAGES_FILE)
+        yield fault("type", message, code=UNSUPPORTED)
+    if connection.broker and not kind.takes_broker:
+        yield _broker_fault("broker", kind)
+    if kind.speaks_dds and are_known:
+        for end, node in ends.items():
+            if config.nodes[node].ros.rmw == "rmw_zenoh_cpp":
+                able = _named(other for other in kinds if not other.speaks_dds)
+                message = (
+                    f"'{node}' runs rmw_zenoh_cpp, but type {kind.name} needs DDS; use type "
+                    f"{able}, or another rmw in {config.file_of(NODES_FILE, node)}"
+                )
+                yield fault(end, message, code=UNSUPPORTED)
+    yield from kind.link_faults(connection, config) if are_known else ()
+    yield from route_faults(kind, connection, config)
+
+
+def _broker_fault(field: str, kind: ConnectionType) -> Fault:
+    able = _named(kind for kind in connection_types.CONNECTION_TYPES if kind.takes_broker)
+    message = f"a broker is for {able} only, but the type is {kind.name}; leave the broker out"
+    return fault(field, message)
+
+
+def route_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
+    kinds = connection_types.CONNECTION_TYPES
+    for index, route in enumerate(connection.topics):
+        if topic_problem(route.source) or topic_problem(route.target):
+            continue  # the checks of the request report this topic
+        where = f"topics[{index}]"
+        for name in route.options():
+            if name not in _ALWAYS and name not in kind.options:
+                able = _named(other for other in kinds if name in other.options)
+                yield fault(
+                    f"{where}.{name}",
+                    f"{name} of '{route.source}' is not supported by {kind.name}; leave it out, or "
+                    f"use type {able}",
+                )
+        yield from kind.route_faults(where, route, connection.key_of(route).sender, config)
+        if route.source != route.target and not kind.renames:
+            able = _named(other for other in kinds if other.renames)
+            yield fault(
+                f"{where}.target",
+                f"'{route.source}' cannot become '{route.target}', because {kind.name} keeps the "
+                f"name of a topic; use the same name at both ends, or use type {able}",
+            )

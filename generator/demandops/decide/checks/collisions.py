@@ -13,10 +13,14 @@ from demandops.base.errors import Fault, InvalidInput, Refused, fault
 from demandops.connections.connection import ClientKey
 from demandops.decide import carriers
 from demandops.decide.booking import request_for
-from demandops.decide.planning import release_keys
 from demandops.decide.planning.flows import outputs
-from demandops.decide.planning.planner import service_name
-from demandops.decide.planning.release_keys import ReleaseKey, is_needed, keys_of_claims
+from demandops.decide.planning.planner import (
+    ReleaseKey,
+    claims_needing,
+    is_needed,
+    keys_of_claims,
+    service_name,
+)
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.demand.demand import Application, Demand
@@ -89,7 +93,7 @@ def faults_of_claim(claim: Claim, before: World, after: World, names: Names) -> 
 def _clashes_of_service(
     request: Demand, after: World, key: ServiceKey, names: Names
 ) -> Iterator[Fault]:
-    claim = next(iter(release_keys.claims_needing(after, key)), None)
+    claim = next(iter(claims_needing(after, key)), None)
     if claim is None:
         return
     first = after.ledger.application(claim.subject.id) or claim.application
@@ -183,7 +187,7 @@ _TOPIC = "topic"
 
 # For each name, the keys of the releases that have it: one, if nobody wrote claims by hand. The
 # releases of suspended claims count too, because they will run again. A key that no claim needs any
-# longer may be left; :func:`.release_keys.is_needed` tells. All names of a large
+# longer may be left; :func:`.planner.is_needed` tells. All names of a large
 # ledger take long to find, so they follow each change, in a map that shares what did not change.
 Names: TypeAlias = "HashTrieMap[Name, HashTrieSet[ReleaseKey]]"
 

@@ -1,34 +1,45 @@
-"""Refuses a demand for what people forbid: by overrides, quotas and policies of versions."""
+"""Refuses a demand for what people forbid or limit.
+
+They do so by overrides, quotas, the capacity of nodes, and policies of versions.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
-from demandops.base.errors import Fault, fault
+from rpds import HashTrieMap
+
+from demandops.base.errors import Fault, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
+from demandops.base.quantities import amount_of, amount_text
 from demandops.connections.connection import Connection
-from demandops.decide.planning import overrides, release_keys
+from demandops.decide.planning import overrides
 from demandops.decide.planning.overrides import Traits, fits, without_suspended
-from demandops.decide.planning.release_keys import (
+from demandops.decide.planning.planner import (
     ReleaseKey,
+    affected_keys,
+    claims_needing,
     contents,
     is_needed,
     keys_of,
     keys_of_claims,
     newest_asked,
+    planned,
+    running_version,
+    version_of_service,
 )
 from demandops.model.config.appdef import VersionPolicy
 from demandops.model.config.base_model import matches
-from demandops.model.config.config import Config
+from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.config.override import Selector, format_time
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ApplicationVersion, precedence
 from demandops.model.demand.demand import Application, Demand, Item
-from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Changes, ClaimChange, World
-from demandops.model.release import Release, ServiceKey, ServiceRelease
+from demandops.model.release import Release, ServiceKey, ServiceRelease, most_replicas
 
 # ---- denials: a demand is refused if an override selects what it asks for ----
 #
@@ -101,7 +112,7 @@ def warnings(request: Demand, world: World) -> Iterator[str]:
     if not any(override.deny for override in world.overrides):
         return
     claims = [
-        *world.ledger.claims_of_demand(request.demand),
+        *world.ledger.claims_with("demand", request.demand),
         *(claim for subject in request.subjects() for claim in world.ledger.claims_on(subject)),
     ]
     for claim in {claim.key: claim for claim in claims}.values():
@@ -113,7 +124,7 @@ def warnings(request: Demand, world: World) -> Iterator[str]:
 
 # ---- quotas of an access domain: claims for each requester, and services on each node ----
 #
-# The quota ``demandsPerMinute`` is checked elsewhere (:mod:`.limits`).
+# The quota ``demandsPerMinute`` is checked elsewhere (:mod:`.agenda`).
 
 
 def quota_faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
@@ -159,7 +170,7 @@ def quota_faults(before: World, after: World, changes: Changes) -> Iterator[Faul
 
 
 def _held(requester: str, world: World, domain: AccessDomain) -> int:
-    claims = world.ledger.claims_of_requester(requester)
+    claims = world.ledger.claims_with("requester", requester)
     return sum(world.config.domain_of.get(claim.held.home) is domain for claim in claims)
 
 
@@ -182,6 +193,99 @@ def _exceeded(domain: AccessDomain, quota: str, most: int, usage: str) -> Fault:
         "something first, or ask for a change of policy/",
         code="quota",
     )
+
+
+# ---- capacity: how much the running services request of each node, and how much the node has ----
+#
+# Each replica of a service requests resources of the node where the replica runs. The service's
+# definition says how much. A shared service counts once. Communication clients request nothing.
+
+# The ids of a node and of a resource, as in ``("edge", "cpu")``.
+Need = tuple[str, str]
+Plans = Mapping[ReleaseKey, Release | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What services request on each node, for each resource, in thousandths of a unit."""
+
+    # This map follows each demand by what the demand changes. Its copies share what stays the same.
+    amounts: HashTrieMap[Need, int] = field(default_factory=HashTrieMap)
+
+    def of(self, node: str, resource: str) -> int:
+        return self.amounts.get((node, resource)) or 0
+
+    def plus(self, growth: Mapping[Need, int]) -> Usage:
+        amounts = self.amounts
+        for need, amount in growth.items():
+            total = self.of(*need) + amount
+            amounts = amounts.insert(need, total) if total else amounts.discard(need)
+        return Usage(amounts)
+
+
+def whole_usage(world: World) -> Usage:
+    """Return what all services request on each node; empty if no node declares a capacity."""
+    if not world.config.limits_capacity:
+        return Usage()
+    apps = (each for each in world.ledger.claims if each.kind is SubjectKind.APPLICATION)
+    keys = dict.fromkeys(key for app in apps for key in keys_of(world, app))
+    return Usage().plus(requests(planned(world, keys), world.config))
+
+
+def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
+    if not config.limits_capacity:
+        return {}
+    change = requests(after, config)
+    change.subtract(requests(before, config))
+    return {need: amount for need, amount in change.items() if amount}
+
+
+def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
+    if not after.config.limits_capacity:
+        return {}
+    keys = affected_keys(before, after, changes)
+    # a release that cannot be planned requests nothing
+    return growth(planned(before, keys), planned(after, keys), after.config)
+
+
+def requests(plans: Plans, config: Config) -> Counter[Need]:
+    total: Counter[Need] = Counter()
+    for release in plans.values():
+        if isinstance(release, ServiceRelease) and release.service.requests:
+            # A machine in several access domains has a node in each, but only one capacity.
+            host, replicas = config.host_of(release.node.id), most_replicas(release.replicas)
+            for resource, quantity in release.service.requests.items():
+                total[host, resource] += amount_of(quantity) * replicas
+    return total
+
+
+def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
+    """Yield (node, reason) for each resource of which a node has too little for the growth."""
+    for (id, resource), amount in sorted(grown.items()):
+        node, used = config.nodes.get(id), usage.of(id, resource)
+        most = node.most(resource) if node else None
+        # Only growth is refused. If a person lowers a capacity below what is used, no demand is
+        # stopped that adds nothing there.
+        if most is not None and amount > 0 and used + amount > most:
+            left = max(most - used, 0)
+            free, capacity, asked = (amount_text(n, resource) for n in (left, most, amount))
+            yield id, f"has {free} of {capacity} {resource} free, but {asked} is asked for"
+
+
+class NoRoom(Refused):
+    """Raised if a demand asks for more than nodes have; ``full`` says of what, by node."""
+
+    def __init__(self, usage: Usage, grown: Mapping[Need, int], config: Config) -> None:
+        self.full: dict[str, list[str]] = {}
+        faults = []
+        for node, excess in excesses(usage, grown, config):
+            self.full.setdefault(node, []).append(excess)
+            message = (
+                f"'{node}' {excess}; choose another node, release something first, or ask "
+                f"for a change of {config.place_of(NODES_FILE)}"
+            )
+            faults.append(fault("", message, code="capacity"))
+        super().__init__(faults)
 
 
 # ---- version differences: demands ask for different versions of what they share ----
@@ -261,46 +365,44 @@ def differences(
         item, claim, old = listed.get(change.key.subject), change.after, change.before
         if item is None or claim is None or not claim.is_on_application:
             continue
-        demanded[claim.application.id] = item, claim.application.version
-        if old is None or old.application.version != claim.application.version:
-            yield from _of_application(item, claim, after)
+        app = claim.application
+        demanded[app.id] = item, app.version
+        if old is not None and old.application.version == app.version:
+            continue
+        versions = after.config.application_versions[app.appdef]
+        # Two words may name one version, for example a channel and a number.
+        if len({versions[word].rank for word in after.ledger.versions_asked(app.id, versions)}) < 2:
+            continue
+        others = after.ledger.replace(claim.key, None)
+        own = versions.get(app.version, versions[""])
+        theirs = newest_asked(others, app.id, versions)
+        if own.rank == theirs.rank:
+            continue
+        holders, held = "", ""
+        for other in others.claims_on(app.subject):
+            word = other.application.version
+            if versions.get(word, versions[""]).rank == theirs.rank:
+                holders, held = ", ".join(other.requesters), word if word in versions else ""
+                break
+        message = (
+            f"{_version_text(app.version, own)} contradicts an existing claim: '{app.id}' is held "
+            f"by {holders} in {_version_text(held, theirs)}; request that version, or use another "
+            "application id"
+        )
+        difference = Difference(
+            f"application '{app.id}'",
+            app.appdef,
+            after.config.appdefs[app.appdef].versions,
+            own.name,
+            theirs.name,
+            own.rank > theirs.rank,
+            item.fault("version", message, code="conflict"),
+        )
+        if difference.matters_to(app.version):
+            yield difference
     for release in plans.values():
         if isinstance(release, ServiceRelease) and len(release.applications) > 1:
             yield from _of_service(release, demanded, before, without_suspended(after))
-
-
-def _of_application(item: Item, claim: Claim, after: World) -> Iterator[Difference]:
-    app, ledger = claim.application, after.ledger
-    versions = after.config.application_versions[app.appdef]
-    # Two words may name one version, for example a channel and a number.
-    if len({versions[word].rank for word in ledger.versions_asked(app.id, versions)}) < 2:
-        return
-    others = ledger.replace(claim.key, None)
-    own, theirs = versions.get(app.version, versions[""]), newest_asked(others, app.id, versions)
-    if own.rank == theirs.rank:
-        return
-    holders, held = "", ""
-    for other in others.claims_on(app.subject):
-        word = other.application.version
-        if versions.get(word, versions[""]).rank == theirs.rank:
-            holders, held = ", ".join(other.requesters), word if word in versions else ""
-            break
-    message = (
-        f"{_version_text(app.version, own)} contradicts an existing claim: '{app.id}' is held by "
-        f"{holders} in {_version_text(held, theirs)}; request that version, or use another "
-        "application id"
-    )
-    difference = Difference(
-        f"application '{app.id}'",
-        app.appdef,
-        after.config.appdefs[app.appdef].versions,
-        own.name,
-        theirs.name,
-        own.rank > theirs.rank,
-        item.fault("version", message, code="conflict"),
-    )
-    if difference.matters_to(app.version):
-        yield difference
 
 
 def _version_text(word: str, version: ApplicationVersion) -> str:
@@ -313,24 +415,22 @@ def _of_service(
 ) -> Iterator[Difference]:
     """Yield the differences of demanded applications, each with the version it asks for."""
     service, key, config = release.service, release.key, after.config
-    versions = {id: release_keys.running_version(after, id) for id in release.applications}
+    versions = {id: running_version(after, id) for id in release.applications}
     if len({contents(version, service) for version in versions.values() if version}) == 1:
         return
     for_what = f"for {key.topic} of '{key.source}'" if key.topic else f"on '{key.node}'"
     what = f"{key.service} {for_what}"
     for id, (item, asked) in demanded.items():
         others = [other for other in versions if other != id]
-        own, theirs = versions.get(id), release_keys.version_of_service(after, service, others)
+        own, theirs = versions.get(id), version_of_service(after, service, others)
         if own is None or contents(own, service) == contents(theirs, service):
             continue
         # The difference was there before the demand.
-        former = release_keys.running_version(before, id)
+        former = running_version(before, id)
         if (
             former
             and former.rank == own.rank
-            and any(
-                claim.application.id == id for claim in release_keys.claims_needing(before, key)
-            )
+            and any(claim.application.id == id for claim in claims_needing(before, key))
         ):
             continue
         # Versions of two definitions have names of their own, so the charts are compared.

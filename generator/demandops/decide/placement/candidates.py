@@ -18,11 +18,11 @@ from demandops.base.errors import Fault, Refused, suggestion
 from demandops.base.quantities import amount_of
 from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
-from demandops.decide.placement import capacity
-from demandops.decide.placement.capacity import Need, NoRoom, Usage
+from demandops.decide.checks import forbidden
+from demandops.decide.checks.forbidden import Need, NoRoom, Usage
 from demandops.decide.planning.flows import instances, version_of_instance
 from demandops.decide.planning.overrides import with_overridden_nodes
-from demandops.decide.planning.release_keys import is_needed
+from demandops.decide.planning.planner import is_needed
 from demandops.model.config import inventory
 from demandops.model.config.appdef import Place, Service
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
@@ -210,7 +210,7 @@ class Choice:
     def _excesses(self, node: Node) -> Iterator[str]:
         if node.capacity is not None and node.id not in self.room.given_back:
             growth = self._growth(node.id)
-            for _, excess in capacity.excesses(self.room.usage, growth, self.config):
+            for _, excess in forbidden.excesses(self.room.usage, growth, self.config):
                 yield excess
 
     def _shortage(self, node: Node) -> list[str]:

@@ -17,6 +17,7 @@ from typing import Generic, TypeVar
 from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
+from demandops.decide.checks.forbidden import NoRoom, Usage
 from demandops.decide.placement import candidates
 from demandops.decide.placement.candidates import (
     NO_ROOM,
@@ -27,7 +28,6 @@ from demandops.decide.placement.candidates import (
     lacks,
     requirement_of,
 )
-from demandops.decide.placement.capacity import NoRoom, Usage
 from demandops.decide.state import State
 from demandops.model.config.appdef import Service
 from demandops.model.demand.demand import Application, Demand, Item
@@ -132,7 +132,7 @@ class _Places(Generic[_Result]):
     def _whole_room(self) -> Room:
         request, ledger = self._request, self._state.ledger
         kept = (each for subject in request.subjects() for each in ledger.kept_claims(subject))
-        own = [*ledger.claims_of_demand(request.demand), *kept]
+        own = [*ledger.claims_with("demand", request.demand), *kept]
         nodes = {node for c in own if c.is_on_application for node in c.application.needed_nodes()}
         placed = Counter(app.node for app in request.applications if app.node)
         return Room(self._state, self._state.usage(), nodes, placed=placed)

@@ -16,12 +16,12 @@ from demandops.decide.admission import admission, permission
 from demandops.decide.booking import Drain, Restoration, conflicts, request_for
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.collisions import Names
-from demandops.decide.placement import candidates, capacity
+from demandops.decide.checks.forbidden import Need, Usage
+from demandops.decide.placement import candidates
 from demandops.decide.placement.candidates import Choice, Chosen, Room
-from demandops.decide.placement.capacity import Need, Usage
 from demandops.decide.planning import overrides
 from demandops.decide.planning.flows import flows, with_booked_outputs
-from demandops.decide.planning.release_keys import affected_keys
+from demandops.decide.planning.planner import affected_keys
 from demandops.model.config.appdef import Service
 from demandops.model.demand.demand import Application, Demand, InputTopic, Item, Requirement
 from demandops.model.ledger.claim import Claim, ClaimKey, requesters_of
@@ -56,7 +56,9 @@ def with_moved(
             replace(world, ledger=ledger), claim, move(claim.application)
         )
     demands = dict.fromkeys(claim.demand for claim in claims)
-    held = (c for old in (world.ledger, ledger) for d in demands for c in old.claims_of_demand(d))
+    held = (
+        c for old in (world.ledger, ledger) for d in demands for c in old.claims_with("demand", d)
+    )
     keys = list(dict.fromkeys(claim.key for claim in held))
     changes = claim_changes(world.ledger, ledger, keys)
     ledger, _ = carriers.without_idle_routes(ledger, world.config, changes)
@@ -197,9 +199,9 @@ def _moved(
     followed = collisions.followed(names, world, after, affected_keys(world, after, changes))
     if faults := [*islice(_faults(world, after, changes, followed), 1)]:
         raise Refused(faults)
-    grown, host = capacity.growth_by(world, after, changes), world.config.host_of(chosen.node)
+    grown, host = forbidden.growth_by(world, after, changes), world.config.host_of(chosen.node)
     there = {need: amount for need, amount in grown.items() if need[0] == host}
-    if (refusal := capacity.NoRoom(usage, there, world.config)).full:
+    if (refusal := forbidden.NoRoom(usage, there, world.config)).full:
         raise refusal
     return after, followed, changes, grown
 
@@ -308,7 +310,7 @@ def _faults(
         yield from collisions.faults_of_claim(claim, before, after, names)
         if not claim.is_on_application:
             former = change.before.connection.topics if change.before else ()
-            held = after.ledger.claims_of_demand(claim.demand)
+            held = after.ledger.claims_with("demand", claim.demand)
             apps = [each.application for each in held if each.is_on_application]
             for index, words in carriers.chosen_twice(claim.connection, apps, after.ledger):
                 if claim.connection.topics[index] not in former:

@@ -457,7 +457,7 @@ def without_idle_holds(
     for demand in dict.fromkeys(change.key.demand for change in changes if change.before):
         while idle := [  # again, because what was held may have held more
             (claim, readers)
-            for claims in [ledger.claims_of_demand(demand)]
+            for claims in [ledger.claims_with("demand", demand)]
             for holding in [{claim.subject.id for claim in claims if claim.is_on_application}]
             for claim in claims
             if claim.is_on_application and (held_for := claim.application.held_for)

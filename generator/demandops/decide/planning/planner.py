@@ -1,75 +1,330 @@
-"""The planner: :func:`plan` returns the release that claims need at a key.
+"""The releases that claims need: their keys, and :func:`plan`, which returns the release at a key.
 
-The keys come from :mod:`.release_keys`. A release follows from the ledger and the
-configuration alone, so every generator and every replay of a commit plans the same.
+A release follows from the ledger and the configuration alone, so every generator and every replay
+of a commit plans the same.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from demandops.base import naming, strict_yaml
-from demandops.base.errors import Refused, suggestion
+from demandops.base.errors import InvalidInput, Refused, suggestion
+from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import connection as routes
-from demandops.connections.connection import Connection, ConnectionType, Route
-from demandops.connections.connection_types import route_faults
-from demandops.decide.planning import overrides, release_keys
+from demandops.connections.connection import ClientKey, Connection, ConnectionType, Route
+from demandops.decide.admission.admission import route_faults
+from demandops.decide.planning import overrides
 from demandops.decide.planning.flows import (
+    instances,
     is_bridged,
+    node_of,
     outputs,
     roots_of,
     topics_of_origin,
     usual_topic,
+    version_of_instance,
 )
 from demandops.decide.planning.overrides import without_suspended
-from demandops.decide.planning.release_keys import ReleaseKey
-from demandops.model.config.appdef import Parameter, Scaling, Service
-from demandops.model.config.config import Config
+from demandops.model.config.appdef import Parameter, Scaling, Service, Services
+from demandops.model.config.config import VERSIONS_FILE, Config
 from demandops.model.config.override import Override
+from demandops.model.config.registry import ApplicationVersion, precedence
 from demandops.model.demand.demand import Application, InputTopic
 from demandops.model.ledger.claim import Claim, requesters_of
-from demandops.model.ledger.ledger import World
+from demandops.model.ledger.ledger import ClaimChange, Ledger, World
 from demandops.model.release import Autoscaler, Release, ServiceKey, ServiceRelease
 
+# ---- the version of an application that is deployed: the newest that its claims ask for ----
+#
+# A claim on an application asks for a named version, or for the default version. A service that
+# several applications share has the newest of the versions of these applications. So the order of
+# the claims does not matter, and two demands that renew in turn do not restart the pods again and
+# again. :mod:`.forbidden` decides whether a demand may ask for another version than the
+# existing demands.
 
-def plan(world: World, key: ReleaseKey) -> Release | None:
+
+def running_version(world: World, application: str) -> ApplicationVersion | None:
+    """Return the deployed version; ``None`` if nobody holds it or its appdef is missing."""
+    app = world.ledger.application(application)
+    versions = world.config.application_versions.get(app.appdef) if app else None
+    return newest_asked(world.ledger, application, versions) if versions else None
+
+
+def newest_asked(
+    ledger: Ledger, application: str, versions: Mapping[str, ApplicationVersion]
+) -> ApplicationVersion:
+    """Return the newest of ``versions`` that claims on an application ask for, or the default."""
+    asked = ledger.versions_asked(application, versions)
+    return max((versions[word] for word in asked or ("",)), key=lambda version: version.rank)
+
+
+def version_of_service(
+    world: World, service: Service, applications: Iterable[str]
+) -> ApplicationVersion:
+    """Return the version in which a service runs for the applications that share it.
+
+    At least one of the applications must have a version (:func:`running_version`).
+
+    Raises:
+        Refused: if another appdef has the same chart version, but different images.
+    """
+    newest: dict[str, ApplicationVersion] = {}
+    for running in filter(None, (running_version(world, id) for id in applications)):
+        if running.rank > newest.setdefault(running.appdef, running).rank:
+            newest[running.appdef] = running
+    # Ranks are comparable only within one appdef, and all versions of a service have its chart. So
+    # among several appdefs, the one with the newest chart decides.
+    versions = [version for _, version in sorted(newest.items())]
+    best = max(versions, key=lambda version: precedence(version.charts[service.chart].version))
+    for other in versions:
+        its, own = contents(other, service), contents(best, service)
+        if its[0] == own[0] and its != own:  # neither is the newest
+            file = world.config.place_of(VERSIONS_FILE)
+            message = (
+                f"application definitions '{best.appdef}' and '{other.appdef}' share "
+                f"{service.chart} {own[0]}, but pin different images; pin the same images, or "
+                f"give one of the definitions another version of the chart, in {file}"
+            )
+            raise Refused.at("version", message, code="conflict")
+    return best
+
+
+def contents(version: ApplicationVersion, service: Service) -> tuple[object, ...]:
+    pins = (version.images.get(name) for name in service.images)
+    return version.charts[service.chart].version, *pins
+
+
+# ---- the keys of the releases that claims need, and of those that a change of claims affects ----
+#
+# Only the releases that :func:`affected_keys` returns are planned again for a demand, so the cost
+# of a demand does not grow with the number of other demands.
+
+ReleaseKey = ServiceKey | ClientKey
+
+
+def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator[ReleaseKey]:
+    # With ``strict``, a missing definition raises Refused, so that no service ends because its
+    # definition was deleted; else nothing is yielded for it.
+    world = without_suspended(world)
+    yield from keys_of_claims(world, world.ledger.claims_on(subject), strict=strict)
+
+
+def keys_of_claims(
+    world: World, claims: Iterable[Claim], *, strict: bool = False
+) -> Iterator[ReleaseKey]:
+    """Yield the keys of the releases that ``claims`` need in ``world``, each once."""
+    keys: dict[ReleaseKey, None] = {}
+    for claim in claims:
+        if not claim.is_on_application:
+            connection = world.ledger.connection(claim.subject.id) or claim.connection
+            assert connection.type is not None, connection.id  # noqa: S101 - a claim has one
+            keys |= dict.fromkeys(connection.type.keys(connection.id, *connection.nodes))
+            continue
+        # The first claim on an application decides its appdef and nodes for all claims on it.
+        first = world.ledger.application(claim.subject.id) or claim.application
+        app = claim.application.moved_to_nodes_of(first)
+        if strict or first.appdef in world.config.services:
+            for service in services_of(world.config, first.appdef).values():
+                keys |= dict.fromkeys(instances(app, service))
+    yield from keys
+
+
+def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
+    """Return the claims that need a service instance, sorted by application and demand.
+
+    For a service that runs once for each cluster, they are grouped by appdef first. Callers pass a
+    world without suspended claims if these must not count.
+    """
+    ledger = world.ledger
+    if key.application is not None:
+        needed = _service(world, key.application, key) is not None
+        return ledger.application_claims(key.application) if needed else ()
+    if key.for_cluster:
+        users = (name for name, own in world.config.services.items() if key.service in own)
+        claims = tuple(claim for name in users for claim in ledger.claims_with("definition", name))
+    elif key.scope == "node":
+        claims = ledger.claims_with("node", key.node)
+    else:
+        claims = ledger.claims_with("takes", str(key.source), str(key.topic))
+    services = {id: _service(world, id, key) for id in {claim.subject.id for claim in claims}}
+    return tuple(
+        claim
+        for claim in claims
+        if (service := services[claim.subject.id]) and takes(claim.application, service, key)
+    )
+
+
+def is_needed(world: World, key: ReleaseKey) -> bool:
+    """Return whether a claim needs a release; suspended claims in ``world`` count."""
+    if isinstance(key, ClientKey):
+        if key.side is None:
+            return bool(world.ledger.ids_with("link", key.type.name, key.id))
+        connection = world.ledger.connection(key.id)
+        return connection is not None and connection.type is key.type
+    if key.application is not None:
+        return _service(world, key.application, key) is not None
+    if key.scope in ("node", "cluster"):
+        return bool(claims_needing(world, key))
+    # Thousands of claims may read a topic. This ends at the first that needs the instance.
+    return any(
+        service is not None and takes(claim.application, service, key)
+        for claim in world.ledger.each_with("takes", str(key.source), str(key.topic))
+        for service in (_service(world, claim.subject.id, key),)
+    )
+
+
+def takes(app: Application, service: Service, key: ServiceKey) -> bool:
+    return not service.roots or bool(roots_of(app, service, key))
+
+
+def _service(world: World, application: str, key: ServiceKey) -> Service | None:
+    """Return the service of an application to which the instance may belong, or ``None``."""
+    first = world.ledger.application(application)
+    services = world.config.services.get(first.appdef, {}) if first else {}
+    service = services.get(key.service)
+    if first is None or service is None or service.scope != key.scope:
+        return None
+    if key.scope == "topic" and version_of_instance(first, service) != key.version:
+        return None
+    return service if node_of(first, service, key.source or key.node) == key.node else None
+
+
+def affected_keys(
+    before: World, after: World, changes: Iterable[ClaimChange]
+) -> tuple[ReleaseKey, ...]:
+    """Return the key of every release that these changes of claims may add, change or remove.
+
+    The cost grows with the number of changed topics. If a change moves an application or gives it
+    another appdef or version, the cost grows with the number of all its topics.
+    """
+    before, after = without_suspended(before), without_suspended(after)
+    keys: dict[ReleaseKey, None] = {}
+    for change in changes:
+        subject, claims = change.key.subject, (change.before, change.after)
+        if change.before and change.after and change.before.is_on_application:
+            # reduced to the inputs that differ, if nothing else that matters to a release does
+            mine, its = change.before.application, change.after.application
+            same_requesters = change.before.requesters == change.after.requesters
+            if (
+                replace(its, inputs=mine.inputs) == mine
+                # a parameter's value may depend on the booking times
+                and not mine.parameters
+                and (same_requesters or not _may_depend_on_requesters(its, after))
+            ):
+                claims = (
+                    replace(change.before, held=_with_inputs_not_in(mine, its)),
+                    replace(change.after, held=_with_inputs_not_in(its, mine)),
+                )
+        old, new = before.ledger.application(subject.id), after.ledger.application(subject.id)
+        is_moved = False
+        if subject.kind is SubjectKind.APPLICATION and old and new:
+            versions = (running_version(world, subject.id) for world in (before, after))
+            ranks = {version and version.rank for version in versions}
+            is_moved = not old.has_same_definition_and_nodes(new) or len(ranks) > 1
+        for world, claim in zip((before, after), claims, strict=True):
+            affected = [claim] if claim and world.ledger.get(claim.key) else []
+            if is_moved:
+                # The claims of other demands did not change, but what they need runs elsewhere now,
+                # or in another version.
+                affected += world.ledger.claims_on(subject)
+            keys |= dict.fromkeys(keys_of_claims(world, affected, strict=world is after))
+    return tuple(keys)
+
+
+def _may_depend_on_requesters(app: Application, world: World) -> bool:
+    # if an override selects by them, or a service's definition derives the replicas from them
+    selectors = (selector for override in world.overrides for selector in override.select)
+    services = world.config.services.get(app.appdef, {}).values()
+    return any(selector.requesters for selector in selectors) or any(
+        service.scaling.may_depend_on_requesters for service in services
+    )
+
+
+def _with_inputs_not_in(app: Application, other: Application) -> Application:
+    inputs = {}
+    for role, topics in app.inputs.items():
+        others = {*other.inputs.get(role, ())}
+        inputs[role] = tuple(topic for topic in topics if topic not in others)
+    return app.with_inputs(inputs)
+
+
+def all_keys(world: World) -> tuple[ReleaseKey, ...]:
+    """Return the key of every release; raise ``Refused`` if a definition is missing."""
+    subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
+    keys = (key for subject in subjects for key in keys_of(world, subject, strict=True))
+    return tuple(dict.fromkeys(keys))
+
+
+def services_of(config: Config, name: str) -> Services:
+    services = config.services.get(name)
+    if services is None:
+        message = f"'{name}' is in use, but appdefs/{name} is gone; restore it"
+        file = f"appdefs/{name}/appdef.yaml"
+        raise Refused.at("type", message, code="unknown-application", file=file)
+    return services
+
+
+# ---- the release at a key ----
+
+
+def plan(world: World, key: ReleaseKey, *, shaped: bool = True) -> Release | None:
     """Return the release at ``key``, or ``None`` if no claim needs it or an override denies it.
+
+    Without ``shaped``, it is the release without the effects of overrides on it.
 
     Raises:
         Refused: if claims contradict each other, if a value of a parameter cannot be used, or if
             the configuration no longer has what a claim needs.
     """
     world = without_suspended(world)
-    release = _unshaped(world, key)
-    return overrides.apply_overrides(release, world) if release else None
-
-
-def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
-    world = without_suspended(world)
-    release = _unshaped(world, key)
-    override = overrides.service_denied_by(release, world) if release else None
-    return (release, override) if release and override else None
-
-
-def _unshaped(world: World, key: ReleaseKey) -> Release | None:
     config = world.config
     if not isinstance(key, ServiceKey):
-        return key.type.client(key, _ClaimedConnections(world, key.type), config)
-    if not (claims := release_keys.claims_needing(world, key)):
+        client = key.type.client(key, _ClaimedConnections(world, key.type), config)
+        return overrides.apply_overrides(client, world) if client and shaped else client
+    if not (claims := claims_needing(world, key)):
         return None
-    apps = [claim.application for claim in claims]
-    first = world.ledger.application(apps[0].id) or apps[0]
-    service = release_keys.services_of(config, first.appdef)[key.service]
+    claimed: dict[str, list[Application]] = {}
+    for claim in claims:
+        claimed.setdefault(claim.subject.id, []).append(claim.application)
+    # Claims on one application may differ if a person wrote one of them. Its first claim decides
+    # the appdef and the nodes, for all of them alike.
+    firsts = [world.ledger.application(id) or apps[0] for id, apps in claimed.items()]
+    service = services_of(config, firsts[0].appdef)[key.service]
     node, domain = config.node_and_domain(key.node)
-    parts = list(_parts(world, service, key, apps))
+    # each application once, with only the inputs that the instance depends on
+    parts, further = list[Application](), False
+    if service.root is not None:
+        source, name = str(key.source), str(key.topic)
+        given = (claim.application.inputs_from(service.root, source, name) for claim in claims)
+        rooted = [topic for topics in given for topic in topics]
+        type = min((topic.type for topic in rooted if topic.type), default="")
+        further = all(topic.further for topic in rooted)
+        shared = {service.root: (InputTopic(name, source, type, further),)}
+        # if all applications give the instance only this one topic, one of them is enough
+        needed = firsts if len(service.inputs) > 1 else firsts[:1]
+        parts = [first.with_inputs(shared) for first in needed]
+    else:
+        for first, same in zip(firsts, claimed.values(), strict=True):
+            own = {
+                role: {
+                    topic
+                    for app in same
+                    for topic in app.inputs.get(role, ())
+                    if not service.roots or topic.source == key.node
+                }
+                for role in service.roots or {role for app in same for role in app.inputs}
+            }
+            parts.append(first.with_inputs({role: tuple(topics) for role, topics in own.items()}))
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for role in sorted(service.inputs):
         read = set[InputTopic]()
         for part in parts:  # perhaps of several definitions, which share the service
-            origin = release_keys.services_of(config, part.appdef)[key.service].inputs[role]
+            origin = services_of(config, part.appdef)[key.service].inputs[role]
             read |= {made.topic for made in topics_of_origin(config, part, origin)}
         # Only some demands name the message type of a topic. An entry without the type sorts first,
         # so the entry with the type replaces it here.
@@ -80,11 +335,9 @@ def _unshaped(world: World, key: ReleaseKey) -> Release | None:
         giving = [claim for claim in claims if name in claim.application.parameters]
         parameters[name] = _merged_value(name, parameter, giving) if giving else parameter.default
     requesters = requesters_of(claims)
-    further = service.root is not None and parts[0].inputs[service.root][0].further
-    applications = tuple(dict.fromkeys(app.id for app in apps))
-    version = release_keys.version_of_service(world, service, applications)
+    version = version_of_service(world, service, claimed)
     topics = [topic for role_topics in inputs.values() for topic in role_topics]
-    return ServiceRelease(
+    release = ServiceRelease(
         key=key,
         name=service_name(config, service, key),
         node=node,
@@ -96,45 +349,25 @@ def _unshaped(world: World, key: ReleaseKey) -> Release | None:
         outputs=MappingProxyType(outputs(config, service, key, further=further)),
         parameters=MappingProxyType(parameters),
         replicas=_replicas_of(service.scaling, parameters, topics, claims, requesters),
-        applications=applications,
+        applications=tuple(claimed),
         requesters=requesters,
     )
+    return overrides.apply_overrides(release, world) if shaped else release
 
 
-def _parts(
-    world: World, service: Service, key: ServiceKey, apps: Iterable[Application]
-) -> Iterator[Application]:
-    """Yield each application once, with only the inputs that the instance depends on."""
-    claimed: dict[str, list[Application]] = {}
-    for app in apps:
-        claimed.setdefault(app.id, []).append(app)
-    shared: dict[str, tuple[InputTopic, ...]] = {}
-    if service.root is not None:
-        source, name = str(key.source), str(key.topic)
-        topics = [topic for app in apps for topic in app.inputs_from(service.root, source, name)]
-        type = min((topic.type for topic in topics if topic.type), default="")
-        further = all(topic.further for topic in topics)
-        shared = {service.root: (InputTopic(name, source, type, further),)}
-    for same in claimed.values():
-        # Claims on one application may differ if a person wrote one of them. Its first claim
-        # decides the appdef and the nodes, for all of them alike.
-        first = world.ledger.application(same[0].id) or same[0]
-        if shared:
-            yield first.with_inputs(shared)
-            if len(service.inputs) == 1:
-                return  # all applications give the instance this one topic, so one is enough
-            continue
-        roles = service.roots or {role for app in same for role in app.inputs}
-        inputs = {
-            role: {
-                topic
-                for app in same
-                for topic in app.inputs.get(role, ())
-                if not service.roots or topic.source == key.node
-            }
-            for role in roles
-        }
-        yield first.with_inputs({role: tuple(topics) for role, topics in inputs.items()})
+def planned(world: World, keys: Iterable[ReleaseKey]) -> dict[ReleaseKey, Release | None]:
+    """Return the releases at ``keys``; one that cannot be planned is None."""
+    releases: dict[ReleaseKey, Release | None] = dict.fromkeys(keys)
+    for key in releases:
+        with suppress(InvalidInput):
+            releases[key] = plan(world, key)
+    return releases
+
+
+def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
+    release = plan(world, key, shaped=False)
+    override = release and overrides.service_denied_by(release, without_suspended(world))
+    return (release, override) if release and override else None
 
 
 def demanded_inputs(
@@ -150,7 +383,7 @@ def demanded_inputs(
             for role, topics in app.inputs.items()
         }
         app = app.with_inputs(inputs)
-    origins = release_keys.services_of(world.config, app.appdef)[key.service].inputs
+    origins = services_of(world.config, app.appdef)[key.service].inputs
     for role in service.inputs:
         for published in topics_of_origin(world.config, app, origins[role]):
             yield role, published.topic.topic

@@ -358,7 +358,7 @@ class Node(CamelModel):
     position: Position | None = None
     # The generator chooses no drained node, and moves away what it placed there
     drained: bool = False
-    # What all services on the node may request together (`demandops.decide.placement.capacity`)
+    # What all services on the node may request together (`demandops.decide.checks.forbidden`)
     capacity: Resources | None = None
     # The node's further domains. For each further domain, the configuration has a node
     # `<id>@<domain>` (`in_domain`).
@@ -374,7 +374,7 @@ class Node(CamelModel):
             )
         return self
 
-    @cached_property
+    @cached_property  # a copy with another id has a selector, so that its labels stay right
     def labels(self) -> Mapping[str, str]:
         return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
 

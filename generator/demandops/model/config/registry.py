@@ -98,9 +98,6 @@ class Image(FrozenModel):
         path = addresses.repository(self.repository).path
         return self.model_copy(update={"repository": f"{registry}/{path}"})
 
-    def parts(self) -> dict[str, str]:
-        return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
-
     def reference(self) -> str:
         return (
             f"{self.repository}@{self.digest}" if self.digest else f"{self.repository}:{self.tag}"

@@ -20,8 +20,8 @@ from demandops.base.errors import MOST_FAULTS, Fault, Refused, fault, field_path
 from demandops.base.naming import id_problem, one_form
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
+from demandops.connections import connection_types
 from demandops.connections.connection import Connection, Route
-from demandops.connections.connection_types import by_number, type_numbered
 from demandops.model.config.base_model import GOAL, FrozenModel, Items, faults_of, seconds_of
 from demandops.model.config.inventory import Coordinate, Position
 from demandops.model.config.repo_settings import ROOT_FILE, Limits
@@ -242,10 +242,11 @@ class WireGoal(FrozenModel):
     shutdown: bool = False
 
     def faults(self) -> Iterator[Fault]:
+        kinds = {kind.number: kind.name for kind in connection_types.CONNECTION_TYPES}
         for index, connection in enumerate(self.connections):
             sources, targets = connection.source_topics, connection.target_topics
-            if type_numbered(connection.type) is None:
-                types = ", ".join(f"{kind.number} ({kind.name})" for kind in by_number())
+            if connection.type not in kinds:
+                types = ", ".join(f"{number} ({name})" for number, name in sorted(kinds.items()))
                 message = f"{connection.type} is not a connection type; known: {types}"
                 yield fault(f"connections[{index}].type", message, code="unknown-connection-type")
             if len(sources) != len(targets):
@@ -274,11 +275,12 @@ class WireGoal(FrozenModel):
             )
             requesters = tuple(dict.fromkeys(body.requester_ids))
             items.append(Item(held, requesters, f"applications[{index}]"))
+        kinds = {kind.number: kind for kind in connection_types.CONNECTION_TYPES}
         for index, connection in enumerate(self.connections):
             topics = zip(connection.source_topics, connection.target_topics, strict=True)
             carried = Connection(
                 connection.id,
-                type_numbered(connection.type),
+                kinds[connection.type],
                 connection.source_node_id,
                 connection.target_node_id,
                 connection.broker_node_id,

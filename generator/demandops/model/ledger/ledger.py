@@ -129,14 +129,8 @@ class Ledger:
                 return inputs[0]
         return None
 
-    def claims_of_demand(self, demand: str) -> tuple[Claim, ...]:
-        return self.claims_with("demand", demand)
-
     def kept_claims(self, subject: Subject | None = None) -> tuple[Claim, ...]:
         return self.claims_with("kept", *([subject.kind.value, subject.id] if subject else []))
-
-    def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
-        return self.claims_with("requester", requester)
 
     def next_lease_end(self) -> datetime | None:
         # of the lease with its slack; `UNSTARTED` if none started

@@ -14,8 +14,8 @@ from demandops.base.naming import SubjectKind
 from demandops.base.quoting import escaped, harmless, is_visible, one_line
 from demandops.base.settings import RENDER_VERSION
 from demandops.decide.booking import Drain, Restoration
-from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision
+from demandops.decide.state import ReleaseChange
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.model.demand.demand import Decommission
 from demandops.model.ledger import claim as claim_files

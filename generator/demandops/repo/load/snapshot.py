@@ -25,8 +25,14 @@ from demandops.base.quoting import one_line
 from demandops.base.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.base.strict_yaml import with_lines
 from demandops.decide import edits
-from demandops.decide.changeset import Change, Changeset, ReleaseChange
-from demandops.decide.state import State, rendered_files, try_configuration
+from demandops.decide.state import (
+    Change,
+    Changeset,
+    ReleaseChange,
+    State,
+    rendered_files,
+    try_configuration,
+)
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.load import load as load_config
 from demandops.model.config.repo_settings import ROOT_FILE

@@ -21,10 +21,8 @@ from demandops.base.errors import InvalidInput, StateRepoError, fault
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import API_VERSION, GENERATED_ROOTS, MAIN_BRANCH, modeline
-from demandops.decide import changeset
-from demandops.decide.changeset import ABSENT, leaf_differences
-from demandops.decide.planning.release_keys import ReleaseKey
-from demandops.decide.state import State
+from demandops.decide.planning.planner import ReleaseKey
+from demandops.decide.state import ABSENT, State, leaf_differences, planned_releases
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.model.config.repo_settings import ROOT_FILE
@@ -273,7 +271,7 @@ class Base:
     theirs: Mapping[str, str] = field(default_factory=dict)
 
     def releases(self) -> dict[ReleaseKey, Release]:
-        return changeset.planned_releases(self.state) if self.state else {}
+        return planned_releases(self.state) if self.state else {}
 
 
 def base_of(repo: Repository, revision: str | None, files: Mapping[str, str]) -> Base:

@@ -20,11 +20,18 @@ from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.runtime import REAL
 from demandops.base.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.base.strict_yaml import with_lines
-from demandops.decide import changeset, override_report, warnings
+from demandops.decide import override_report, warnings
 from demandops.decide.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
-from demandops.decide.changeset import MergePreview
 from demandops.decide.edits import expired_overrides, faults_of_edit, update_ledger
-from demandops.decide.state import State, rendered_files, try_configuration
+from demandops.decide.state import (
+    MergePreview,
+    State,
+    planned_releases,
+    preview,
+    render_faults,
+    rendered_files,
+    try_configuration,
+)
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
 from demandops.model.config.load import load
@@ -117,15 +124,15 @@ def check(
         edited = [
             path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
         ]
-        new = changeset.planned_releases(state)
-        preview = changeset.preview(
+        new = planned_releases(state)
+        previewed = preview(
             start.releases() if start.commit else new, new, edit.before_merge(wanted), wanted
         )
         charts = rendered_charts.render_charts(
-            state, edit.changed if start.commit else None, {file.path for file in preview.files}
+            state, edit.changed if start.commit else None, {file.path for file in previewed.files}
         )
         faults += charts.faults
-        written = {file.path: file.after for file in preview.files if file.after is not None}
+        written = {file.path: file.after for file in previewed.files if file.after is not None}
         faults += rendered_charts.manifest_faults(written)
         if require_helm and rendered_charts.MISSING in charts.not_rendered.values():
             faults.append(fault("", rendered_charts.NO_HELM))
@@ -141,8 +148,8 @@ def check(
                     booked = bookkeeping_changes(bookkeeping(start.state), bookkeeping(state))
         result = replace(
             result,
-            preview=preview,
-            pending=tuple(edit.pending(preview)),
+            preview=previewed,
+            pending=tuple(edit.pending(previewed)),
             charts=charts,
             bookkeeping=booked,
             warnings=(
@@ -369,7 +376,7 @@ class _Edit:
         try:
             return rendered_files(state, self.generated_before)
         except InvalidInput as error:
-            faults = changeset.render_faults(state, state.evaluate, self.changed)
+            faults = render_faults(state, state.evaluate, self.changed)
             raise InvalidInput(faults or error.faults) from None
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:

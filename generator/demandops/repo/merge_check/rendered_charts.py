@@ -32,8 +32,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.decide import changeset
-from demandops.decide.state import State, trial_releases
+from demandops.decide.state import State, planned_releases, trial_releases
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import DOMAINS_FILE, Config
 from demandops.model.release import ServiceRelease
@@ -216,7 +215,7 @@ def render_charts(  # noqa: PLR0912
     config, result, helm = state.config, RenderedCharts(), Helm.find()
     # by folder, the releases, and whether each is an example
     by_folder: dict[str | None, list[tuple[ServiceRelease, bool]]] = {}
-    for release in changeset.planned_releases(state).values():
+    for release in planned_releases(state).values():
         if isinstance(release, ServiceRelease):
             by_folder.setdefault(release.chart.folder, []).append((release, False))
     edited, paths = sorted(changed or ()), sorted(config.files)

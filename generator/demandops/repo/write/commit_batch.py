@@ -157,8 +157,9 @@ class CommitBatch:
 
     def end_override(self, override: Override, now: datetime) -> None:
         # InvalidInput is raised if the state without the override cannot be planned or rendered
-        applied = edits.end_override(self.head.state, override, now)
-        state = replace(self.head.state, ledger=applied.ledger)
+        state = self.head.state
+        applied = edits.update_ledger(state, state, (), {}, now, ending=[override])
+        state = replace(state, ledger=applied.ledger)
         change = snapshots.render_all(self._tree, state, applied.files)
         more = self.head.trailers
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
