@@ -272,21 +272,26 @@ def describe_change(
         old_facts, new_facts = frozenset(before), frozenset(after)
         details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
         details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
-    effect = _effect(release, current, text)
+    effect = _effect(old, new, current, text)
     return ReleaseChange(
         release.name, release.description, path_of(release), kind, tuple(details), effect
     )
 
 
-def _effect(release: Release, current: str | None, text: str | None) -> Effect:
-    if current is None or text is None:
+def _effect(
+    old: Release | None, new: Release | None, current: str | None, text: str | None
+) -> Effect:
+    if text is None or current is None:
         return "stops" if text is None else "starts"
+    had, has = (getattr(side, "replicas", None) != 0 for side in (old, new))
+    if had is not has:
+        return "starts" if has else "stops"
     (was, before), (now, after) = map(gitops.values_apart, (current, text))
     if before != after:
         return "restarts"
     if was == now:  # only comments differ, which name overrides
         return ""
-    live = {*release.service.live, *_ALWAYS_LIVE} if isinstance(release, ServiceRelease) else set()
+    live = {*new.service.live, *_ALWAYS_LIVE} if isinstance(new, ServiceRelease) else set()
     differing = {name for name in {**was, **now} if was.get(name, ABSENT) != now.get(name, ABSENT)}
     return "reconfigures" if differing <= live else "restarts"
 

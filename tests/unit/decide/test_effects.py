@@ -47,7 +47,7 @@ def test_an_input_reconfigures_a_service_that_takes_it_over(gitops: str) -> None
     ("changed", "effect"),
     [
         ({"values": {"inputs": {"egoData": ["/other"]}}}, "reconfigures"),
-        ({"replicas": 0}, "reconfigures"),
+        ({"replicas": 0}, "stops"),
         ({"values": {"inputs": {"egoData": ["/other"]}, "fusion": {"nodeName": "x"}}}, "restarts"),
         ({"images": {"object-fusion": {"tag": "2"}}}, "restarts"),
         ({"hold": True}, ""),
