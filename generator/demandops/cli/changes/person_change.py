@@ -34,7 +34,7 @@ from demandops.decide.state import (
     FileReader,
     ReleaseChange,
     State,
-    describe_change,
+    described,
     planned_releases,
 )
 from demandops.model.ledger.claim import requesters_of
@@ -193,27 +193,6 @@ def writable(options: Options) -> Iterator[Reader]:
         yield repo
 
 
-def _differing(before: State, after: State, old: Releases, new: Releases) -> list[ReleaseChange]:
-    def text(release: Release | None, state: State) -> str | None:
-        if release is None:
-            return None
-        with suppress(InvalidInput):
-            return gitops.render(release, state.config, state.evaluate)
-        return ""
-
-    changes = []
-    for key in {**old, **new}:
-        was, now = old.get(key), new.get(key)
-        if was == now:
-            continue
-        texts = text(was, before), text(now, after)
-        change = describe_change(was, now, *texts)
-        # a release also has what no file shows, such as whether its node is drained
-        if change.change != "change" or change.details or texts[0] != texts[1]:
-            changes.append(change)
-    return sorted(changes, key=lambda change: (change.change, change.name))
-
-
 def commit(
     repo: Reader,
     files: Mapping[str, str | None],
@@ -230,8 +209,20 @@ def commit(
         before = repo.snapshot(progress=report)
         after = person_commit.state_after(repo.repository, before, files)
 
+    def text(release: Release | None, state: State) -> str | None:
+        with suppress(InvalidInput):
+            return gitops.render(release, state.config, state.evaluate) if release else None
+        return None
+
     old, new = planned_releases(before.state), planned_releases(after)
-    changes = _differing(before.state, after, old, new)
+    changes = []
+    for key in {**old, **new}:
+        was, now = old.get(key), new.get(key)
+        # a release also has what no file shows, such as whether its node is drained
+        if was != now:
+            change = described(was, now, text(was, before.state), text(now, after))
+            changes += [change] if change.change != "change" or change.details else []
+    changes.sort(key=lambda change: (change.change, change.name))
     stopped = _stopped(old, new, repo.file_reader())
     who = {name for r in stopped for name in requesters_of(claims_of(r, before.state.ledger))}
     suspended = {claim.key for claim, _ in suspended_claims(before.state)}
