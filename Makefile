@@ -153,7 +153,6 @@ golden: setup  ## Rewrite the golden files, and the schemas and tables of the ch
 	@$(PY) -m tests.unit.messages
 
 bench: system-page setup  ## Measure the event detector, the page, and the cost of commits and demands as the ledger grows
-	@$(PY) -m tests.benchmarks.commits
 	@$(PY) -m tests.benchmarks.growth
 	@$(PY) -m tests.benchmarks.detector
 	@$(PY) -m tests.benchmarks.page
