@@ -39,6 +39,8 @@ OF_THE_ROOT = {
         "project/ros-launch.md"
     ),
     "examples/experiment/full/README.md": "project/experiment.md",
+    "tests/README.md": "project/tests.md",
+    "tests/scenarios/README.md": "project/scenarios.md",
     "tests/e2e/README.md": "project/e2e.md",
     "tests/e2e/PROOF.md": "project/e2e-proof.md",
     "tests/e2e/rig/README.md": "project/e2e-rig.md",

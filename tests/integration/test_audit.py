@@ -10,13 +10,11 @@ from typing import Any
 
 import pytest
 from demandops.cli.main import run as run_command
-from demandops.model.config.override import format_time
 from demandops.model.ledger.claim import read
 
 from tests.golden.cases import GOLDEN, requests_of
 from tests.integration.conftest import On
-from tests.kit.cli import Ran, Run
-from tests.kit.goals import APP, EXPERIMENT, connection, goal, put
+from tests.kit.goals import APP, EXPERIMENT, connection, goal
 from tests.kit.repo import FORGER, GitRepo, git
 
 ROOT = Path(__file__).parents[2]
@@ -41,10 +39,6 @@ def played(_played: Path, state: GitRepo) -> GitRepo:
     shutil.rmtree(state.path)
     shutil.copytree(_played, state.path)
     return state
-
-
-def newer_images(state: GitRepo) -> dict[str, str | None]:
-    return {IMAGES: state.files()[IMAGES].replace("2025-04", "2025-05")}
 
 
 def test_git_finds_commits_as_the_docs_say(played: GitRepo) -> None:
@@ -78,75 +72,19 @@ def test_git_finds_commits_as_the_docs_say(played: GitRepo) -> None:
     assert authors == {"author vehicle02, station00 (requesters)"}
 
 
-class TestWhy:
-    def test_a_release_that_runs(self, on: On, played: GitRepo) -> None:
-        found = on.json("why", FUSION)
-        assert (found["runs"], found["kind"], found["commit"]) == (True, "release", played.tip)
-        assert (found["node"], found["cluster"]) == ("edge", "c-its")
-        assert (found["namespace"], found["domain"]) == ("perception", "perception")
-        assert found["file"] == f"{EDGE}/{FUSION}.yaml"
-        assert found["requesters"] == ["station00", "vehicle02", "vehicle03"]
-        files = played.files("ledger/")
-        assert len(found["claims"]) == 2
-        for claim in found["claims"]:
-            booked = read(files[claim["file"]], claim["file"])
-            assert claim["requesters"] == list(booked.requesters)
-            assert claim["demand"] == booked.demand
-            assert claim["since"] == format_time(booked.booked)
-            assert booked.request in claim["release_by"]
-        shaping = {one["file"]: one["what"] for one in found["shaped_by"]}
-        assert set(shaping) == {
-            "demandops.yaml",
-            "appdefs/object-detection-fusion/appdef.yaml",
-            "appdefs/object-detection-fusion/values/object-fusion.yaml.j2",
-            "registry/charts.yaml",
-            IMAGES,
-            "inventory/nodes.yaml",
-            "policy/access-domains.yaml",
-        }
-        assert set(shaping) <= set(played.files())
-        assert shaping["registry/charts.yaml"].startswith("version 0.1.0 from folder ")
-        assert found["overrides"] == []
-        said = git(played, "log", "--format=%H", "main", "--", found["file"]).splitlines()
-        assert [one["commit"] for one in [*found["changes"], found["started"]]] == said
-        assert (found["stopped"], found["more_changes"]) == (None, 0)
-        bounded = on.json("why", FUSION, "-n", "1")
-        assert [one["commit"] for one in bounded["changes"]] == said[:1]
-        assert bounded["more_changes"] == len(said) - 2
-        assert bounded["started"]["commit"] == said[-1]
-
-    @pytest.mark.parametrize("case", ["zenoh", "ros"])
-    def test_every_release_of_other_carriers(self, on: On, state: GitRepo, case: str) -> None:
-        overlay = GOLDEN / case / "state-repo"
-        files = [file for file in overlay.rglob("*") if file.is_file()]
-        state.commit({file.relative_to(overlay).as_posix(): file.read_text() for file in files})
-        assert on("request", requests_of(case)[0]).code == 0
-        clients = [path for path in state.manifests() if "/_" not in path]
-        assert clients
-        for path in clients:
-            found = on.json("why", Path(path).stem)
-            assert (found["runs"], found["file"]) == (True, path)
-            assert found["claims"]
-            assert {claim["file"] for claim in found["claims"]} <= set(state.files("ledger/"))
-            assert found["started"]["operation"] == "join"
-
-    def test_rubbish_is_refused(self, demandops: Run, played: GitRepo) -> None:
-        for name in ("", "-", "..", "*", ":(glob)**", "clusters/", "clusters/../x", "ledger//x",
-                     "\x1b[1m"):  # fmt: skip
-            ran = demandops("why", "--state-repo", played.path, "--", name)
-            assert ran.code in (0, 1) and "\x1b" not in ran.err
-
-    def test_a_demand_in_a_history_that_was_made_anew(
-        self, on: On, demandops: Run, state: GitRepo, tmp_path: Path
-    ) -> None:
-        on.request(put("patrol-7"))
-        git(state, "branch", "anew", git(state, "commit-tree", "-m", "All", "main^{tree}"))
-        git(tmp_path, "clone", "--quiet", "--bare", "--single-branch", "--branch", "anew",
-            str(state.path), "anew.git")  # fmt: skip
-        git(tmp_path / "anew.git", "branch", "-m", "anew", "main")
-        ran = demandops("why", "patrol-7", "--state-repo", tmp_path / "anew.git")
-        assert (ran.code, ran.err) == (0, "")
-        assert ran.out.startswith("demand patrol-7 holds claims at ")
+@pytest.mark.parametrize("case", ["zenoh", "ros"])
+def test_why_explains_every_release_of_other_carriers(on: On, state: GitRepo, case: str) -> None:
+    overlay = GOLDEN / case / "state-repo"
+    files = [file for file in overlay.rglob("*") if file.is_file()]
+    state.commit({file.relative_to(overlay).as_posix(): file.read_text() for file in files})
+    assert on("request", requests_of(case)[0]).code == 0
+    clients = [path for path in state.manifests() if "/_" not in path]
+    assert clients
+    for path in clients:
+        found = on.json("why", Path(path).stem)
+        assert (found["runs"], found["file"]) == (True, path)
+        assert {claim["file"] for claim in found["claims"]} <= set(state.files("ledger/"))
+        assert found["claims"] and found["started"]["operation"] == "join"
 
 
 def test_one_thing_has_the_documented_keys_in_every_command(on: On, played: GitRepo) -> None:
@@ -157,62 +95,40 @@ def test_one_thing_has_the_documented_keys_in_every_command(on: On, played: GitR
     back = on.json("rollback", "main~1", "--dry-run")
     failed = on("log", "nothing", "--output", "json")
     assert keys["commit"] == [*on.json("log")[0]] == list(told["started"])[:-1]
-    assert keys["claim"] == [*back["restored"][0]] == [*told["claims"][0]][:-4]
+    assert keys["claim"] == [*back["restored"][0]]
+    assert {*keys["claim"]} <= {*told["claims"][0]}
     assert keys["subject"] == [*told["subject"]] == [*told["claims"][0]["subject"]]
-    running = [*on.json("status")["releases"][0]]  # with more about its health
-    assert keys["release"] == [*told["releases"][0]] == running[: len(keys["release"])]
+    for release in (told["releases"][0], on.json("status")["releases"][0]):  # and its health
+        assert keys["release"] == [*release][: len(keys["release"])]
     assert keys["changed release"] == [*changed["releases"][0]] == [*back["releases"][0]]
     assert keys["changed entry of the bookkeeping"] == [*changed["bookkeeping"][0]]
     assert keys["fault"] == [*failed.json()["faults"][0]]
 
 
-class TestRollback:
-    @pytest.fixture
-    def roll(self, on: On, played: GitRepo) -> Run:
-        def back(*args: str) -> Ran:
-            return on("rollback", *args, "--yes", "--output", "json")
-
-        return back
-
-    def test_books_and_files_are_what_they_were(self, on: On, played: GitRepo, roll: Run) -> None:
-        config = played.path / "config"
-        person = "[user]\n\tname = Ada <A>\n\temail = ada@example.org\n"
-        config.write_text(config.read_text() + person)
-        wanted = git(played, "rev-parse", "main~2:ledger", "main~2:clusters")
-        before = played.tip
-        dry = roll("main~2", "--dry-run").json()
-        assert (played.tip, dry["commit"]) == (before, None)
-        ran = roll("main~2", "-m", "they left\nby mistake")
-        found = ran.json()
-        assert found == dry | {"commit": played.tip}
-        assert (ran.code, found["outcome"]) == (0, "restored")
-        assert git(played, "rev-parse", "main:ledger", "main:clusters") == wanted
-        assert (found["dropped"], found["changed_back"]) == ([], [])
-        assert {tuple(one["requesters"]) for one in found["restored"]} == {
-            ("station00", "vehicle00"),
-            ("station00", "vehicle01"),
-        }
-        assert f"+ {DETECTION}" in git(played, "log", "-1", "--format=%b", "main")
-        trailers = "%(trailers:key=Operation,key=Restores,key=Reason,valueonly,separator=%x2C)"
-        said = git(played, "log", "-1", f"--format=%an|%ae|{trailers}", "main")
-        trailers = f"rollback,{found['to']},they left by mistake"
-        assert said == f"Ada (A)|ada@example.org|{trailers}"
-        assert [row["commit"] for row in on.json("log", "--operation", "rollback")] == [played.tip]
-        assert on("verify").code == 0
-
-    def test_it_wants_a_commit_of_this_history(self, on: On, played: GitRepo) -> None:
-        git(played, "config", "user.name", "x")
-        git(played, "config", "user.email", "x@example.org")
-        other = git(played, "commit-tree", "-m", "other", f"{played.tip}^{{tree}}")
-        ran = on("rollback", other, "-m", "x", "-y")
-        assert ran.code == 1 and f"commit {other} is not in the history" in ran.err
-
-    def test_no_request_file_rolls_back(self, on: On, played: GitRepo) -> None:
-        before = played.tip
-        made = {"apiVersion": "demandops/v1", "kind": "Rollback", "to": before,
-                "dropNewer": True, "reason": "x", "by": ["x", "x"]}  # fmt: skip
-        ran = on.request(made)
-        assert (ran.code, played.tip) == (1, before)
+def test_a_rollback_gives_back_books_and_files(on: On, played: GitRepo) -> None:
+    git(played, "config", "user.name", "Ada <A>")
+    git(played, "config", "user.email", "ada@example.org")
+    wanted = git(played, "rev-parse", "main~2:ledger", "main~2:clusters")
+    before, back = played.tip, ("rollback", "main~2", "--yes")
+    dry = on(*back, "--output", "json", "--dry-run").json()
+    assert (played.tip, dry["commit"]) == (before, None)
+    found = on(*back, "--output", "json", "-m", "they left\nby mistake").json()
+    assert found == dry | {"commit": played.tip, "outcome": "restored"}
+    assert git(played, "rev-parse", "main:ledger", "main:clusters") == wanted
+    assert (found["dropped"], found["changed_back"]) == ([], [])
+    assert {*map(tuple, (one["requesters"] for one in found["restored"]))} == {
+        *(("station00", vehicle) for vehicle in ("vehicle00", "vehicle01"))
+    }
+    assert f"+ {DETECTION}" in git(played, "log", "-1", "--format=%b", "main")
+    trailers = "%(trailers:key=Operation,key=Restores,key=Reason,valueonly,separator=%x2C)"
+    said = git(played, "log", "-1", f"--format=%an|%ae|{trailers}", "main")
+    trailers = f"rollback,{found['to']},they left by mistake"
+    assert said == f"Ada (A)|ada@example.org|{trailers}"
+    assert [row["commit"] for row in on.json("log", "--operation", "rollback")] == [played.tip]
+    assert on("verify").code == 0
+    other = git(played, "commit-tree", "-m", "other", f"{played.tip}^{{tree}}")
+    ran = on("rollback", other, "-m", "x", "-y")
+    assert ran.code == 1 and f"commit {other} is not in the history" in ran.err
 
 
 FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 3\n"
@@ -259,10 +175,9 @@ class TestVerifyByDifferences:
     def test_what_a_person_changed_holds(
         self, played: GitRepo, verdict: Callable[..., Any]
     ) -> None:
-        assert verdict(newer_images(played))["holds"]
+        assert verdict({IMAGES: played.files()[IMAGES].replace("2025-04", "2025-05")})["holds"]
         for_a_folder = {"ledger": "a file\n"}
-        row = verdict(lambda: dict.fromkeys(played.files("ledger/")) | for_a_folder)
-        assert row["holds"]
+        assert verdict(lambda: dict.fromkeys(played.files("ledger/")) | for_a_folder)["holds"]
 
     @pytest.mark.parametrize(
         ("path", "operation"),

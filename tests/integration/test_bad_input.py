@@ -9,19 +9,12 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
-from demandops.cli.authoring.schema import SCHEMAS
-from demandops.cli.target import ContextsFile
-from demandops.cluster.clusters_file import AccessFile
-from demandops.detect.rule_file import RuleFile
 
 from tests.integration.conftest import On
 from tests.kit import plain_yaml
-from tests.kit.forms import CONFIG_MODELS, GOAL_MODELS, Form, mutations, own_goal, reference_goal
-from tests.kit.goals import perception
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo
 
@@ -36,62 +29,6 @@ def _nothing_is_left_behind(data_home: Path) -> Iterator[None]:
         lines = [yaml.safe_load(line) for line in journal.read_text().splitlines()]
         done = {line["done"] for line in lines if "done" in line}
         assert not [line for line in lines if "done" not in line and line["operation"] not in done]
-
-
-def test_a_broken_book_is_told_and_not_taken_for_an_empty_one(on: On, state: GitRepo) -> None:
-    on.book(perception())
-    (path, *_) = sorted(p for p in state.files("ledger/") if p.endswith(".yaml"))
-    whole = state.files()[path]
-    state.commit({path: whole[:60]})
-    before = on("bookkeeping", "--output", "json")
-    assert f"not in effect: {path}: " in before.err
-    assert before.json()["services"]
-    on.book(perception(id="another"))
-    assert state.files("ledger/")[path] == whole
-
-
-@pytest.mark.parametrize(
-    ("path", "text"),
-    [
-        (f"{APPDEF}/values/object-detection.yaml.j2", "replicas: many"),
-        (f"{CHART}/values.schema.json", "{"),
-        (f"{CHART}/values.yaml", "a: ["),
-    ],
-    ids=["values", "schema", "defaults"],
-)
-def test_of_a_chart_that_people_broke_the_last_valid_version_stays_in_force(
-    on: On, state: GitRepo, caplog: pytest.LogCaptureFixture, path: str, text: str
-) -> None:
-    state.commit({path: text})
-    on.book(perception())
-    assert any("/od-" in manifest for manifest in state.manifests())
-    assert state.files()[path] == text, "the generator must not change what people wrote"
-    assert path in caplog.text
-
-
-@pytest.mark.parametrize(
-    ("valid", "model"), list(zip((reference_goal, own_goal), GOAL_MODELS, strict=True))
-)
-def test_a_mistake_anywhere_in_a_goal_changes_nothing(
-    on: On, state: GitRepo, data_home: Path, valid: Any, model: Any
-) -> None:
-    """A sample only; ``tests/unit/demand/test_mistakes_in_goals.py`` tries every mistake."""
-    form, before = Form(model.model_json_schema()), state.tip
-    wrong = [m for m in mutations(valid()) if form.forbids(m.document)]
-    for mutation in wrong[:: len(wrong) // 4]:
-        ran = on.request(mutation.document)
-        (row,) = ran.json()
-        assert (ran.code, row["outcome"], row["commit"], state.tip) == (1, "refused", None, before)
-        fields = [fault["field"] for fault in row["faults"]]
-        assert any(map(mutation.is_at, fields)), (mutation.place, mutation.kind, fields)
-    on.book(perception())
-    assert list(data_home.rglob("outbox.jsonl")), "the fixture must find the journal"
-
-
-def test_the_schemas_of_files_and_goals_are_the_tried_ones() -> None:
-    of_other_tests = {AccessFile, ContextsFile, RuleFile}
-    shown = {model for model, _ in SCHEMAS.values()} - of_other_tests
-    assert shown == {*CONFIG_MODELS.values(), *GOAL_MODELS}
 
 
 TOLD = plain_yaml.load(Path(__file__).with_name("attacks.yaml").read_text())
@@ -170,15 +107,6 @@ class TestYamlAttacks:
         assert {id: entry["requesters"] for id, entry in connections.items()} == {
             text: [text] for text in (*texts, "2026-02-01")
         }
-
-    def test_what_cannot_be_read_is_named(self, on: On, tmp_path: Path) -> None:
-        for file, told in (
-            (tmp_path / "none", f"{tmp_path}/none: cannot be read: No such file or directory"),
-            (tmp_path, f"{tmp_path}: cannot be read: Is a directory"),
-            ("-", "standard input: is not UTF-8 text"),
-        ):
-            errors = on.refused("request", file, stdin=bytes(range(256)))
-            assert errors.startswith(f"error: {told}; ")
 
     def test_no_control_character_of_a_file_reaches_the_terminal(
         self, on: On, tmp_path: Path

@@ -24,7 +24,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import POLICY, GitRepo, git, tip
+from tests.kit.repo import git, tip
 from tests.kit.rig import wait_until
 from tests.kit.ros import Served
 
@@ -92,19 +92,13 @@ def test_a_third_type_of_application_is_demanded_with_yaml_alone(
     assert stages == [s for s in ("admitted", "booked", "committed", "pushed") if s in stages]
 
 
-@pytest.mark.parametrize(("fields", "told"), REFUSED["fields"])
 def test_every_field_is_in_the_message_and_named_in_a_refusal(
-    shared: Served, vehicle: DemandClient, before: str, fields: dict[str, Any], told: str
+    shared: Served, vehicle: DemandClient, before: str
 ) -> None:
-    with pytest.raises(DemandError) as caught:
-        vehicle.put("refused", [RECORDER | fields])
-    assert told in str(caught.value)
-    assert tip(shared.state_repo) == before
-
-
-def test_a_refusal_has_a_code_and_what_cannot_be_sent_is_a_value_error(
-    shared: Served, vehicle: DemandClient
-) -> None:
+    for fields, told in REFUSED["fields"]:
+        with pytest.raises(DemandError) as caught:
+            vehicle.put("refused", [RECORDER | fields])
+        assert told in str(caught.value)
     with pytest.raises(DemandError) as caught:
         vehicle.release("refused")
     assert caught.value.code == "not-held"
@@ -112,7 +106,12 @@ def test_a_refusal_has_a_code_and_what_cannot_be_sent_is_a_value_error(
         vehicle.put("refused", [{"node_id": "edge"}])
     with pytest.raises(ValueError, match="surrogates not allowed"):
         vehicle.put("refused \ud800")
-    assert vehicle.put("refused", connections=[link("refused")]).outcome == "booked"
+    assert tip(shared.state_repo) == before
+    # without access to the clusters, a goal is answered at `pushed`
+    answer = vehicle.put("refused", connections=[link("refused")], answer="healthy")
+    assert (answer.outcome, answer.reached) == ("booked", "pushed")
+    (warning,) = answer.warnings
+    assert warning.endswith("not at 'healthy': this node has no access to the clusters")
     topics = shared.bookkeeping()["connections"]["refused"]["topics"]
     assert topics == {"/refused/a": ["vehicle00"], "/refused/b": ["vehicle00"]}
 
@@ -128,13 +127,6 @@ def test_services_run_where_the_message_says(shared: Served, vehicle: DemandClie
         on = {one["service"]: one["node"] for one in found}
         assert on == {"recorder": "cloud", "driver": driver}
     assert vehicle.release("where").outcome == "released"
-
-
-def test_without_access_to_the_clusters_a_goal_is_answered_at_pushed(vehicle: DemandClient) -> None:
-    answer = vehicle.put("healthy", connections=[link("healthy")], answer="healthy")
-    assert (answer.outcome, answer.reached) == ("booked", "pushed")
-    (warning,) = answer.warnings
-    assert warning.endswith("not at 'healthy': this node has no access to the clusters")
 
 
 def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(
@@ -172,37 +164,12 @@ def test_numbers_that_the_message_does_not_define_are_refused_with_their_field(
     assert {"operation", "answer"} <= set(fields)
 
 
-@pytest.fixture
-def short_leases(shared: Served) -> Iterator[None]:
-    """While the test runs, leases in the access domain last two seconds by default."""
-    repo = GitRepo(Path(shared.state_repo))
-    text = repo.files(POLICY)[POLICY]
-    policy = yaml.safe_load(text)
-    policy["domains"][0]["leases"] = {"default": "2s", "slack": "0s"}
-    repo.commit({POLICY: yaml.safe_dump(policy)})
-    yield
-    repo.commit({POLICY: text})
-
-
-@pytest.mark.usefixtures("short_leases")
-@pytest.mark.nightly  # its leases last two seconds
-def test_a_demand_of_a_client_that_died_ends_and_one_that_is_renewed_does_not(
+def test_a_held_demand_is_renewed_and_put_again_if_it_has_ended(
     shared: Served, vehicle: DemandClient, before: str
 ) -> None:
-    def booked() -> set[str]:
-        return {"kept", "left"} & shared.bookkeeping()["connections"].keys()
-
-    with vehicle.demand("kept", connections=[link("kept")]) as kept:
-        assert kept.answer is not None and kept.answer.lease_s == 2
-        assert vehicle.put("left", connections=[link("left")]).lease_s == 2
-        wait_until(lambda: "expire" in operations(shared, before), "the lease has ended")
-        assert booked() == {"kept"}, "the renewed demand must stay booked"
-    assert booked() == set()
-
-
-def test_a_held_demand_that_has_ended_is_put_again(vehicle: DemandClient) -> None:
     with vehicle.demand("lost", connections=[link("lost")], lease=3) as held:
         first = held.commit
+        wait_until(lambda: "renew" in operations(shared, before), "the lease is renewed")
         vehicle.release("lost")
         wait_until(lambda: held.commit != first, "the demand is put again")
 

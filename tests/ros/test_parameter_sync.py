@@ -110,24 +110,18 @@ def test_a_node_follows_without_a_restart_and_after_one(
     assert sync.stop(signal.SIGTERM) == 0, log.read_text()
 
 
-def test_parameters_have_dotted_names_and_a_node_overrides_all_nodes() -> None:
+def test_parameters_have_dotted_names_and_a_file_that_gives_a_node_nothing_is_refused() -> None:
     text = "/**: {ros__parameters: {a: 1, b: {c: 2}}}\n/node: {ros__parameters: {b: {c: [x]}}}\n"
-    assert parameters_of("node", text, "f") == {"a": 1, "b.c": ["x"]}
+    assert parameters_of("node", text, "f") == {"a": 1, "b.c": ["x"]}  # a node overrides all nodes
     assert Parameter("b.c", value=["x"]).type_ is Parameter.Type.STRING_ARRAY
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("- 1", "f: must map nodes to their parameters"),
-        ("other: {}", "f: node: has no parameters of the node; write node: {ros__parameters: …}"),
-        ("node: {}", "f: node.ros__parameters: must be a mapping"),
-    ],
-)
-def test_a_file_that_gives_a_node_nothing_is_refused(text: str, message: str) -> None:
-    with pytest.raises(InvalidInput) as refused:
-        parameters_of("/node", text, "f")
-    assert str(refused.value) == message
+    for text, told in (
+        ("- 1", "must map nodes to their parameters"),
+        ("other: {}", "node: has no parameters of the node; write node: {ros__parameters: …}"),
+        ("node: {}", "node.ros__parameters: must be a mapping"),
+    ):
+        with pytest.raises(InvalidInput) as refused:
+            parameters_of("/node", text, "f")
+        assert str(refused.value) == f"f: {told}"
 
 
 def test_what_cannot_be_used_is_refused_at_the_start(servers: Servers, tmp_path: Path) -> None:
