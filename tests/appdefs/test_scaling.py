@@ -104,17 +104,6 @@ def test_the_page_shows_the_template_that_serves_both() -> None:
         assert text in path.read_text(), path.name
 
 
-SHIPPED = "appdefs/object-detection-fusion/appdef.yaml"
-BY_WHO = "{min: 0, max: 9, per: {requesters: 1}, mayDependOnRequesters: true, dividesWork: true}"
-BY_CLAIMS = "{min: 0, max: 9, per: {claims: 1}, dividesWork: true}"
-FOLLOWING = {
-    SHIPPED: skeleton()[SHIPPED]
-    .replace("prefix: od\n", f"prefix: od\n    scaling: {BY_WHO}\n")
-    .replace("prefix: of\n", f"prefix: of\n    scaling: {BY_CLAIMS}\n")
-}
-"""An appdef with one detection for each requester and one fusion for each claim."""
-
-
 @pytest.mark.parametrize(
     ("scaling", "selected", "requesters", "files", "services"),
     [

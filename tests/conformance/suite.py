@@ -111,10 +111,13 @@ class Servers:
         return Answer(True, answer.outcome or "no outcome", text)
 
     def books(self) -> dict[str, Any]:
+        """Return who requests what, and the commit that says so; nothing if nobody can be asked."""
+        data: dict[str, Any] = {"services": {}, "connections": {}, "commit": "none"}
+        if not self.are_asked:
+            return data
         asked = self._books.call_async(GetBookkeeping.Request())
         self.client.wait(asked.done)
-        data: dict[str, Any] = json.loads(asked.result().bookkeeping_json or "{}")
-        return {"services": {}, "connections": {}, "commit": "none"} | data
+        return data | json.loads(asked.result().bookkeeping_json or "{}")
 
 
 # ---- a rule of rules.yaml ----
@@ -127,13 +130,17 @@ class Rule:
         self._name, self._steps, self._servers = name, steps, servers
 
     def try_it(self) -> None:
+        books = self._servers.books()
         try:
             for number, step in enumerate(self._steps, 1):
                 answer = self._send(step)
                 if not answer.is_as(step["is"], step.get("says", "")):
                     raise Unlike(f"goal {number} must be {step['is']}; {answer}")
+                before, books = books, self._servers.books()
+                if step["is"] not in ("booked", "released") and books != before:
+                    raise Unlike(f"goal {number} is {step['is']}, and made {books['commit']}")
                 if self._servers.are_asked:
-                    self._compare(number, step)
+                    self._compare(number, step, books)
         finally:
             for step in self._steps:  # end what was booked, so that no rule meets another
                 verb = self._verb(step)
@@ -141,8 +148,7 @@ class Rule:
                     rest = {key: step[key] for key in ("who", "id", "of", "node") if key in step}
                     self._send(rest | {ENDS[verb]: ""})
 
-    def _compare(self, number: int, step: dict[str, Any]) -> None:
-        books = self._servers.books()
+    def _compare(self, number: int, step: dict[str, Any], books: dict[str, Any]) -> None:
         tables: dict[str, Iterable[dict[str, list[str]]]] = {
             "held": (entry["topics"] for entry in books["connections"].values()),
             "read": (
@@ -248,7 +254,7 @@ def an_ended_goal_cannot_be_cancelled(servers: Servers) -> None:
 
 def the_paper_s_table(servers: Servers, orders: Iterable[tuple[int, ...]]) -> None:
     """Let vehicles join and leave; the steps of each order are numbered as in the paper."""
-    before = paper.observed(servers.books()) if servers.are_asked else {}
+    before = paper.observed(servers.books())
     for order in orders:
         inside: set[str] = set()
         for step in order:

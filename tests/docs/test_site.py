@@ -35,7 +35,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_the_reference_has_all_that_the_code_has(site: Path) -> None:
     build(load_config(str(ROOT / "mkdocs.yml"), site_dir=str(site)))
-    assert (site / "recipes.html").read_text().count("fleet/inventory/nodes/bus07.yaml") == 1
+    assert (site / "recipes.html").read_text().count("fleet/inventory/nodes/vehicle07.yaml") == 1
     text = {path.stem: path.read_text() for path in (site / "generated").glob("*.html")}
     assert all(f'<h2 id="{name}">' in text["commands"] for name in COMMANDS)
     assert all(f'<h2 id="{name}">' in text["schemas"] for name in SCHEMAS)

@@ -1,4 +1,9 @@
-"""Fixtures for the tests of both controllers; the fixture `rig` of their folders decides which."""
+"""Fixtures for the end-to-end tests, which run once with each GitOps controller.
+
+A test that uses `rig`, or what is made of it, runs as `…[flux]` and as `…[argocd]`, with the
+markers `flux` and `argocd`. `only` marks what one controller alone can do, or what does not depend
+on the controller: `@pytest.mark.only("flux", "why")`.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +15,36 @@ from typing import Any
 import pytest
 from demandops_ros import DemandClient
 
-from tests.e2e.common.expected import CLUSTER, WITHOUT_DEMANDS
+from tests.e2e.common.expected import CLUSTER, NODES
 from tests.e2e.common.intrusion import FILE, NEIGHBOUR, withdraw
-from tests.e2e.common.ros import Client
-from tests.e2e.common.world import VIEWS, World
-from tests.e2e.rig.cluster import Rig
+from tests.e2e.common.world import DOMAINS, World, running
+from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Manifest, build_manifest
 from tests.e2e.rig.tools import Report
-from tests.kit.ros import reserved
-
-pytest.register_assert_rewrite("tests.e2e.common.answers", "tests.e2e.common.steps")
+from tests.kit.limits import PATIENCE_S
+from tests.kit.ros import Client, reserved
 
 MakeWorld = Callable[[], World]
 SlipIn = Callable[..., None]
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    for name in DOMAINS:
+        config.addinivalue_line("markers", f"{name}: needs a cluster with this controller")
+    config.addinivalue_line("markers", "only(gitops, reason): runs with this controller alone")
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    if "gitops" not in metafunc.fixturenames:
+        return
+    only = metafunc.definition.get_closest_marker("only")
+    variants = []
+    for name in DOMAINS:
+        marks = [getattr(pytest.mark, name)]
+        if only and name != only.args[0]:
+            marks.append(pytest.mark.skip(reason=only.args[1]))
+        variants.append(pytest.param(name, marks=marks))
+    metafunc.parametrize("gitops", variants, indirect=True, scope="session")
 
 
 @pytest.fixture(autouse=True)
@@ -43,6 +65,20 @@ def say(request: pytest.FixtureRequest) -> Report:
 
 
 @pytest.fixture(scope="session")
+def gitops(request: pytest.FixtureRequest) -> Gitops:
+    controller: Gitops = request.param
+    return controller
+
+
+@pytest.fixture(scope="session")
+def rig(gitops: Gitops, tmp_path_factory: pytest.TempPathFactory, say: Report) -> Iterator[Rig]:
+    """One cluster for all tests with a controller."""
+    folder = tmp_path_factory.mktemp(f"rig-{gitops}")
+    with running(Rig(CLUSTER, folder, gitops=gitops, nodes=NODES, report=say)) as rig:
+        yield rig
+
+
+@pytest.fixture(scope="session")
 def ros_domain() -> Iterator[int]:
     with reserved() as domain:
         yield domain
@@ -59,10 +95,15 @@ def client(ros_domain: int) -> Iterator[Client]:
 def make_world(
     rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[MakeWorld]:
-    """Return a function that creates a state repo, which no cluster follows yet."""
+    """Return a function that creates a state repo, which no cluster follows yet.
+
+    It removes the one before: a cluster follows one, and a ROS domain has one generator.
+    """
     made: list[World] = []
 
     def make() -> World:
+        for world in made:
+            world.remove()
         made.append(World(rig, tmp_path_factory.mktemp("world"), ros_domain, client))
         return made[-1]
 
@@ -75,25 +116,22 @@ def make_world(
 def world(make_world: MakeWorld, rig: Rig) -> World:
     """A state repo that the cluster follows, with a running generator and no demand."""
     made = make_world()
-    made.bootstrap(CLUSTER, rig)
-    made.generator.start()
-    made.domain.wait_lines(WITHOUT_DEMANDS)
+    made.begin(rig)
     return made
 
 
 @pytest.fixture
 def requester(ros_domain: int) -> Iterator[DemandClient]:
-    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=120) as made:
+    with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=2 * PATIENCE_S) as made:
         yield made
 
 
 @pytest.fixture
 def edge_is_full(rig: Rig) -> Iterator[Callable[[], None]]:
     """Keep pods from being scheduled on the edge; yield a function that allows it again."""
-    (edge,) = rig.kube.find("Node", selector="node_id=edge")
 
     def unschedulable(value: bool | None) -> None:
-        rig.kube.patch("Node", edge["metadata"]["name"], {"spec": {"unschedulable": value}})
+        rig.kube.patch("Node", "edge", {"spec": {"unschedulable": value}})
 
     unschedulable(True)
     yield lambda: unschedulable(None)
@@ -106,7 +144,7 @@ def neighbour(rig: Rig) -> Iterator[Any]:
     # Kubernetes creates the service account and the ConfigMap
     rig.kube.wait("the account", lambda: rig.kube.get("ServiceAccount", "default", NEIGHBOUR))
     rig.kube.wait("the root", lambda: rig.kube.get("ConfigMap", "kube-root-ca.crt", NEIGHBOUR))
-    yield VIEWS[rig.gitops](rig.kube, NEIGHBOUR, "none")
+    yield DOMAINS[rig.gitops](rig.kube, NEIGHBOUR, "none")
     rig.kube.delete("Namespace", NEIGHBOUR)
 
 

@@ -171,13 +171,6 @@ def names_a_library(lab: Lab, word: str) -> None:
         chart(lab, CHART, name="object-fusion" if word else word, dependencies=[entry])
 
 
-def names_a_folder(lab: Lab, word: str) -> None:
-    file = lab.checkout / "registry" / "charts.yaml"
-    if file.is_file() and not file.is_symlink():
-        text = file.read_text().replace(f"folder: {CHART}", f"folder: {json.dumps(word)}")
-        put(lab, "registry/charts.yaml", text)
-
-
 def links(lab: Lab, word: str) -> None:
     for path in FOLDERS[len(word) % len(FOLDERS) :][:2]:
         put_other(lab, path, lambda at: at.symlink_to(word.replace("\0", "") or ".."))
@@ -215,15 +208,6 @@ def refers_elsewhere(lab: Lab, word: str) -> None:
     chart(lab, f"{CHART}/charts/part")
 
 
-def makes_a_circle(lab: Lab, word: str) -> None:
-    for each, other in (("a", "b"), ("b", "c"), ("c", "a")):
-        needed = {"name": other, "repository": f"file://../{other}", "alias": word or other}
-        chart(lab, f"{CHARTS}/{each}", dependencies=[needed])
-    chart(lab, CHART, dependencies=[{"name": "a", "repository": "file://../a"}])
-    itself = {"name": "self", "repository": "file://../.."}
-    chart(lab, f"{CHART}/charts/self", dependencies=[itself])
-
-
 def doubles(lab: Lab, word: str) -> None:
     for number in range(30):
         repository = f"file://../l{number + 1}"
@@ -252,12 +236,6 @@ def digs(lab: Lab, word: str) -> None:
         file.truncate(1 << 25)
 
 
-def writes_odd_metadata(lab: Lab, word: str) -> None:
-    texts = ["[]", "x", f"name: {'[' * 90}", "version: 1", "\0", "dependencies: {a: [1]}"]
-    texts += [f"dependencies: [{json.dumps(word)}, null, [], {{name: 7}}, {{name: {{}}}}]"]
-    put(lab, FILES[len(word) % len(FILES)], texts[len(word) % len(texts)])
-
-
 def writes_hostile_templates(lab: Lab, word: str) -> None:
     text = (
         f'{{{{ .Files.Get "../../../../../../sentinel/secret" }}}}{{{{ getHostByName "{word}" }}}}'
@@ -269,9 +247,9 @@ def writes_hostile_templates(lab: Lab, word: str) -> None:
 
 
 STEPS = [
-    names_a_library, names_a_folder, links, links_files,
-    leaves_a_pipe, packs_an_archive, refers_elsewhere, makes_a_circle, doubles, nests_git, digs,
-    writes_odd_metadata, writes_hostile_templates,
+    names_a_library, links, links_files,
+    leaves_a_pipe, packs_an_archive, refers_elsewhere, doubles, nests_git, digs,
+    writes_hostile_templates,
 ]  # fmt: skip
 WORDS = st.sampled_from([
     "../../..", "../../../../../../sentinel", "../../../../../..", "/etc", "/", "/dev/zero",

@@ -8,12 +8,10 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 from demandops.cli.main import run
-from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.limits import PATIENCE_S
@@ -54,23 +52,6 @@ def test_an_interrupted_request_says_which_demands_are_answered(
     assert signal.getsignal(signal.SIGTERM) is handler
     assert rig.restart(bare) is True
     assert 60 - unsent - 1 <= len(rig.operations(bare)) <= 60 - unsent
-
-
-def test_an_interrupt_of_the_first_request_says_that_it_has_no_answer(
-    bare: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = tmp_path / "demand.yaml"
-    file.write_text(yaml.safe_dump(rig.goal(1)))
-    submit = Generator.submit
-
-    def interrupted(generator: Generator, *arguments: Any, **more: Any) -> None:
-        submit(generator, *arguments, **more)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(Generator, "submit", interrupted)
-    assert run(["request", str(file), "--state-repo", str(bare)]) == 130
-    told = capfd.readouterr().err
-    assert " has no answer yet" in told and "0 of 1 requests have an answer" in told
 
 
 def test_an_interrupted_check_leaves_no_folder(person: Person, tmp_path: Path) -> None:

@@ -73,20 +73,15 @@ def mend(state: GitRepo, person: Person) -> None:
     person.change({path: before[path] for path in broken}, "Mend the inventory and the claim")
 
 
-def test_its_history_verifies_and_holds_what_the_facts_say(on: On, state: GitRepo) -> None:
+def test_its_history_verifies_and_check_and_upgrade_name_the_faults_on_main(
+    demandops: Run, on: On, state: GitRepo, tmp_path: Path
+) -> None:
     assert (state.tip, branches(state.path)) == (FACTS["main"], [FACTS["proposal"]["branch"]])
     assert_verified(on, root(state.path))
     assert Counter(file["kind"] for file in ledger(state)) == FACTS["kinds"]
-    assert {*FACTS["ledger"]} <= state.files("ledger/").keys()
     services = on("bookkeeping", "--output", "json").json()["services"]
-    assert services.keys() <= {*FACTS["releases"]}
     names = {path.rpartition("/")[2].removesuffix(".yaml") for path in state.manifests()}
-    assert {*FACTS["releases"]} <= names
-
-
-def test_check_and_upgrade_name_the_faults_on_main(
-    demandops: Run, on: On, state: GitRepo, tmp_path: Path
-) -> None:
+    assert services.keys() <= {*FACTS["releases"]} <= names
     git(tmp_path, "clone", "--quiet", str(state.path), "clone")
     faults = demandops("check", tmp_path / "clone", "--output", "json").json()["faults"]
     told = on.refused("upgrade")

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import json
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
@@ -18,16 +18,10 @@ import yaml
 import zenoh
 
 from tests.golden.cases import rendered
-from tests.kit.limits import PATIENCE_S
+from tests.kit.rig import wait_until
 
 STEP = "2-station00-joins"
 """A step of the golden case `zenoh` in which the edge and the station have an endpoint."""
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +33,9 @@ def configurations() -> dict[str, str]:
         if path.startswith("clusters/") and name.startswith("zenoh-"):
             config, _ = yaml.safe_load_all(text)
             found[name.removeprefix("zenoh-")] = config["data"]["config.json5"]
-    edge, station, router = (f"127.0.0.1:{free_port()}" for _ in range(3))
+    with ExitStack() as stack:
+        free = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(3)]
+        edge, station, router = (f"127.0.0.1:{each.getsockname()[1]}" for each in free)
     here = {
         "edge.example:7448": edge,
         "10.0.0.2:7448": edge,
@@ -65,26 +61,17 @@ def sessions(configurations: dict[str, str]) -> Iterator[dict[str, Any]]:
         session.close()
 
 
-def wait(done: Callable[[], bool]) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not done():
-        assert time.monotonic() < until
-        time.sleep(0.05)
-
-
-def test_zenoh_reads_the_whole_text(configurations: dict[str, str]) -> None:
+def test_zenoh_reads_the_whole_text_and_refuses_a_field_that_it_does_not_know(
+    configurations: dict[str, str],
+) -> None:
     assert configurations.keys() == {"edge", "station00", "vehicle00"}
     for text in configurations.values():
         assert zenoh.Config.from_json5(text)
+        with pytest.raises(zenoh.ZError):
+            zenoh.Config.from_json5(json.dumps(json.loads(text) | {"listne": {}}))
 
 
-def test_zenoh_refuses_a_field_that_it_does_not_know(configurations: dict[str, str]) -> None:
-    whole = json.loads(configurations["edge"])
-    with pytest.raises(zenoh.ZError):
-        zenoh.Config.from_json5(json.dumps(whole | {"listne": {}}))
-
-
-def test_each_node_links_with_those_it_has_connections_with_and_no_other(
+def test_each_node_links_with_those_it_has_connections_with_and_data_arrives(
     sessions: dict[str, Any],
 ) -> None:
     ids = {str(session.info.zid()): node for node, session in sessions.items()}
@@ -96,10 +83,7 @@ def test_each_node_links_with_those_it_has_connections_with_and_no_other(
         }
 
     expected = {"edge": {"station00", "vehicle00"}, "station00": {"edge"}, "vehicle00": {"edge"}}
-    wait(lambda: links() == expected)
-
-
-def test_what_one_node_puts_arrives_at_another_that_is_linked(sessions: dict[str, Any]) -> None:
+    wait_until(lambda: links() == expected, "they link with no other")
     arrived: list[bytes] = []
     subscriber = sessions["edge"].declare_subscriber(
         "points", lambda sample: arrived.append(bytes(sample.payload))
@@ -109,6 +93,6 @@ def test_what_one_node_puts_arrives_at_another_that_is_linked(sessions: dict[str
         sessions["vehicle00"].put("points", b"here")  # again and again: a subscription needs time
         return bool(arrived)
 
-    wait(put)
+    wait_until(put, "it arrives")
     subscriber.undeclare()
     assert set(arrived) == {b"here"}

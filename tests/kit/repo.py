@@ -130,7 +130,8 @@ class GitRepo:
 class Person:
     """A person who changes the state repo: at its forge, or by a push from a clone."""
 
-    def __init__(self, remote: Path, folder: Path) -> None:
+    def __init__(self, remote: Path | str, folder: Path) -> None:
+        """Only :meth:`fetch`, :meth:`push` and :meth:`write` take a ``remote`` with a URL."""
         self.bare, self.folder = remote, folder
 
     def _git(self, *args: str) -> str:
@@ -154,7 +155,7 @@ class Person:
             (self.folder / path).write_text(str(text))
 
     def read(self, path: str) -> str:
-        return GitRepo(self.bare).files()[path]
+        return GitRepo(Path(self.bare)).files()[path]
 
     def change(
         self,
@@ -166,7 +167,7 @@ class Person:
         who = who or ("Petra Platform", "petra@example.org", int(time.time()))
         for _ in range(100):
             with suppress(pygit2.GitError):  # a generator published first: try again
-                return GitRepo(self.bare).commit(files, f"{message}\n", who)
+                return GitRepo(Path(self.bare)).commit(files, f"{message}\n", who)
         raise AssertionError("each of 100 attempts met a commit that was published first")
 
     def push(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:

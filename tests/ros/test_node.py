@@ -59,22 +59,6 @@ def test_a_client_that_numbers_its_goals_ends_what_it_joined_if_ids_are_ignored(
     assert "request 'ignored-id'" in git(served.state_repo, "log", "--format=%B", "main")
 
 
-def test_a_goal_that_cannot_be_honoured_is_aborted_with_code_field_and_remedy(
-    shared: Served, caller: Client
-) -> None:
-    before = tip(shared.state_repo)
-    refused = caller.call(connection(1001, target_node_id="egde"))
-    assert refused.accepted and refused.status == "aborted"
-    assert refused.message == (
-        "unknown-node: connections[0].target_node_id: 'egde' is not in inventory/nodes.yaml; "
-        "did you mean 'edge'?"
-    )
-    assert (refused.feedback, tip(shared.state_repo)) == ([], before)
-    booked, again = caller.call(connection(1001)), caller.call(connection(1001))
-    assert (booked.status, again.status) == ("succeeded", "succeeded")
-    assert again.message == booked.message.replace("booked", "unchanged")
-
-
 def test_a_hostile_id_stands_on_one_line_in_result_and_log(shared: Served, caller: Client) -> None:
     hostile = "a\n[ERROR] forged\x1b[2J\u202e" + "x" * 5000
     refused = caller.call({**connection(1002), "id": hostile})

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import yaml
 from demandops.base.errors import Fault, Refused
 from demandops.decide.booking import Drain
+from demandops.decide.checks.forbidden import whole_usage
 from demandops.decide.decision import Decision, decide
 from demandops.decide.edits import changed_claim_files
 from demandops.decide.placement.relocation import following_overrides
@@ -238,6 +239,8 @@ class World(MemoryRepo):
     def assert_sound(self) -> None:
         """Check that the files are exactly those of the ledger and of the ledger's releases."""
         assert ledger_in(self.files) == self.state.ledger
+        counted = whole_usage(self.state).amounts
+        assert self.state.usage().amounts == counted, "a change updates what nodes have left"
         asked = rendered_files(self.state, self.files)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())

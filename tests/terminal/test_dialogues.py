@@ -31,22 +31,6 @@ def test_options_that_are_not_given_are_asked_for(checkout: Path) -> None:
 
 
 @pytest.mark.nightly  # sees whole seconds pass
-def test_a_slow_fetch_is_shown_while_it_lasts(state: GitRepo, tmp_path: Path) -> None:
-    slow = tmp_path / "slow-ssh"
-    slow.write_text('#!/bin/sh\nsleep 1.5\nexec sh -c "$2"\n')
-    slow.chmod(0o755)
-    url = f"ssh://host{state.path}"
-    get = ("get", "demands", "-o", "name", "--state-repo", url)
-    ssh = {"GIT_SSH_COMMAND": str(slow), "GIT_SSH_VARIANT": "simple"}
-    with Dialogue(*get, folder=tmp_path, **ssh) as talk:
-        assert talk.end() == 0, talk.text
-    shown, _, after = talk.text.rpartition("\x1b[2K")
-    assert f"fetching {url}, 1 s" in shown
-    assert "fetching" not in after
-    assert not after.strip(), "the command printed rows although nothing is demanded"
-
-
-@pytest.mark.nightly  # sees whole seconds pass
 def test_a_cluster_that_does_not_answer_is_waited_for_until_ctrl_c_or_a_time_has_passed(
     state: GitRepo, tmp_path: Path
 ) -> None:

@@ -59,7 +59,7 @@ def test_each_function_on_the_path_of_a_demand_exists() -> None:
 
 TEST_FILES = sorted((ROOT / "tests").rglob("test_*.py"))
 PROCESSES = ("test-processes", "test-packages", "page", "docs", "simulate", "faults")
-TARGETS = ("test", *PROCESSES, "e2e", "e2e-argocd")
+TARGETS = ("test", *PROCESSES, "e2e")  # e2e-argocd runs the files of e2e, by another marker
 
 
 @lru_cache

@@ -1,4 +1,4 @@
-"""Every property of the published schemas has a description and a valid example."""
+"""The published schemas describe every property with an example, and say patterns in words."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import jsonschema_rs
 import pytest
+from demandops.base.naming import PATTERN_WORDS
 from demandops.cli.authoring import schema
 
 FILE = "templates/schemas/properties.yaml"
@@ -49,3 +50,22 @@ def test_nothing_else_is_described_and_each_entry_has_at_most_an_example() -> No
     assert listed.keys() - known == set()
     odd = [field for field, said in listed.items() if len(said) > 2 or not isinstance(said[0], str)]
     assert odd == []
+
+
+def patterns_of(part: Any) -> set[str]:
+    if isinstance(part, list):
+        return {found for each in part for found in patterns_of(each)}
+    if not isinstance(part, dict):
+        return set()
+    found = {part["pattern"]} if isinstance(part.get("pattern"), str) else set[str]()
+    found |= {*part.get("patternProperties", {})}
+    return found | {each for value in part.values() for each in patterns_of(value)}
+
+
+def test_every_pattern_of_a_file_is_said_in_words() -> None:
+    used = {
+        one
+        for model, _ in schema.SCHEMAS.values()
+        for one in patterns_of(model.model_json_schema())
+    }
+    assert used == PATTERN_WORDS.keys()

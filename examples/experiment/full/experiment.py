@@ -59,7 +59,8 @@ class Experiment:
             return self._drive()
 
     def _start_cluster(self) -> None:
-        rig = Rig(CLUSTER, gitops=self._settings.gitops, nodes=fleet.NODES, report=self._say)
+        folder, gitops = self._made("rig"), self._settings.gitops
+        rig = Rig(CLUSTER, folder, gitops=gitops, nodes=fleet.NODES, report=self._say)
         self._rig = self._stack.enter_context(rig)
         self._rigs = {CLUSTER: rig}
         self._say("the cluster is up")

@@ -173,8 +173,10 @@ class LargeExperiment(Experiment):
 
     def _start_cluster(self) -> None:
         vehicles = [route.vehicle for route in self._routes]
-        self._rig = self._stack.enter_context(Rig(CLUSTER, nodes=NODES, report=self._say))
-        fleet = self._stack.enter_context(Rig(FLEET, nodes=vehicles, git_of=self._rig))
+        first = Rig(CLUSTER, self._made("rig"), nodes=NODES, report=self._say)
+        self._rig = self._stack.enter_context(first)
+        second = Rig(FLEET, self._made("rig-fleet"), nodes=vehicles, git_of=first)
+        fleet = self._stack.enter_context(second)
         self._rigs = {CLUSTER: self._rig, FLEET: fleet}
         self._domains = {"cloud": self._stack.enter_context(reserved())}
         self._say(f"two clusters are up, with {len(vehicles) + len(NODES)} nodes")

@@ -5,10 +5,8 @@ tests need; `make demo` needs none of it.
 """
 # ruff: noqa: F401 - the experiment imports from here what is imported here
 
-from tests.e2e.common.access import access_file, documented_roles, limited
-from tests.e2e.common.answers import limited_world
+from tests.e2e.common.access import access_file, documented_roles, limited, limited_world
 from tests.e2e.common.expected import CLUSTER, FUSION, WITHOUT_DEMANDS
-from tests.e2e.common.ros import Client
 from tests.e2e.common.volumes import files as volume_files
 from tests.e2e.common.world import World, demandops, environment
 from tests.e2e.rig import launch
@@ -21,4 +19,4 @@ from tests.kit.detection import write_bag
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import git
 from tests.kit.rig import wait_until
-from tests.kit.ros import reserved
+from tests.kit.ros import Client, reserved

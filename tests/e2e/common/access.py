@@ -1,4 +1,4 @@
-"""A cluster's access file, and a kubeconfig with few rights."""
+"""A generator that may watch and wake a cluster: its access file, its kubeconfig, its rights."""
 
 from __future__ import annotations
 
@@ -7,11 +7,35 @@ from pathlib import Path
 
 import yaml
 
+from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import Kube, Manifest, build_manifest
+from tests.kit.limits import PATIENCE_S
 
+from .expected import CLUSTER
+from .world import World
+
+TIMEOUT_S = PATIENCE_S
+"""How long an answer may wait for what happens by itself."""
 _RBAC = "rbac.authorization.k8s.io"
 _ACCOUNT = "generator"
 _DEPLOY = Path(__file__).parents[3] / "deploy"
+
+
+def limited_world(world: World, rig: Rig, **source: str) -> World:
+    """Let the cluster follow a new state repo; its generator gets the rights of docs/status.md."""
+    world.bootstrap(CLUSTER, rig, **source)
+    rights = documented_roles(rig.gitops)
+    kubeconfig = limited(rig.kube, rig.kubeconfig, world.folder, rights)
+    access_file(world.folder, {CLUSTER: {"kubeconfig": kubeconfig}})
+    restart_generator(world)
+    return world
+
+
+def restart_generator(world: World, timeout_s: float = TIMEOUT_S) -> None:
+    """Start the generator anew; an answer waits so long for the cluster."""
+    world.generator.stop()
+    options = ("--clusters", str(world.folder / "clusters.yaml"))
+    world.generator.start(*options, "--ros-args", "-p", f"answer_timeout:={timeout_s}")
 
 
 def access_file(folder: Path, clusters: Mapping[str, Mapping[str, object]]) -> Path:

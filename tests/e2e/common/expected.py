@@ -45,10 +45,6 @@ def demand(step: int) -> dict[str, Any]:
     return goal
 
 
-def title(step: int) -> str:
-    return str(paper.STEPS[step - 1])
-
-
 def source_end(node: str) -> str:
     return f"mqtt-{node}-edge-source-{_ENDS[node][0]}"
 

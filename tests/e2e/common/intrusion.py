@@ -10,9 +10,12 @@ import yaml
 
 from tests.e2e.rig.kube import Manifest, build_manifest
 
+from .world import World
+
 NEIGHBOUR = "neighbour"  # a namespace that belongs to no access domain
 FOLDER = "clusters/c-its/perception"
 FILE, BASE = f"{FOLDER}/edge/foreign.yaml", f"{FOLDER}/foreign/kustomization.yaml"
+ELSEWHERE = "elsewhere"  # a folder that is not the domain's
 _RBAC = "rbac.authorization.k8s.io"
 _BY_POLICY = " is not possible with podSecurity: host-network of access domain 'perception'"
 _PODS = yaml.safe_load(Path(__file__).with_name("pods.yaml").read_text())
@@ -48,13 +51,6 @@ def makers(spec: Manifest) -> Iterator[Manifest]:
     yield build_manifest("batch/v1", "CronJob", "foreign", "perception", spec=cron)
 
 
-def privileged_deployment() -> tuple[Manifest, str]:
-    """Return a Deployment of privileged pods, and the reason of its refusal."""
-    spec, reason = FORBIDDEN["privileged"]
-    (deployment,) = (maker for maker in makers(spec) if maker["kind"] == "Deployment")
-    return deployment, reason
-
-
 def config(name: str, namespace: str) -> Manifest:
     return build_manifest("v1", "ConfigMap", name, namespace, data={"made": "by hand"})
 
@@ -66,10 +62,9 @@ def binding(kind: str, namespace: str = "") -> Manifest:
     return build_manifest(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])
 
 
-def withdraw(world: Any) -> None:
+def withdraw(world: World) -> None:
     """Remove the committed files that still exist, and wait until the removal is applied."""
     commit = world.tip()
-    if there := {FILE, BASE} & set(world.person.git("ls-files").split()):
-        commit = world.push(dict.fromkeys(there))
-    world.domain.wake()
-    world.domain.wait_applied(commit)
+    if left := world.git("ls-files", FILE, BASE, ELSEWHERE).split():
+        commit = world.push(dict.fromkeys(left))
+    world.domain.follow(commit)

@@ -37,18 +37,11 @@ class Pod:
     def __init__(self, kube: Kube, name: str, namespace: str, server: str, folder: Path) -> None:
         """Read the pod from the API; ``server`` is the API server's host and port."""
         self._kube, self._namespace, self._folder = kube, namespace, folder
-        found = kube.get("Pod", name, namespace)
-        assert found is not None
+        self._server = server
+        found = kube.wait(f"pod {name}", lambda: kube.get("Pod", name, namespace))
         self.manifest: Manifest = found
         self.log = folder / f"{name}.log"
-        self._start = 0
-        self._host, self._port = server.rsplit(":", 1)
         self._process: Any = None
-
-    @property
-    def container(self) -> dict[str, Any]:
-        (container,) = self.manifest["spec"]["containers"]
-        return dict(container)
 
     @property
     def pid(self) -> int:
@@ -59,11 +52,11 @@ class Pod:
         return self._process.poll()
 
     def start(self) -> None:
-        container, security = self.container, self.manifest["spec"]["securityContext"]
+        spec = self.manifest["spec"]
+        security, (container,) = spec["securityContext"], spec["containers"]
         assert container["securityContext"]["readOnlyRootFilesystem"]
         sources = {
-            volume["name"]: self._volume(volume, security["fsGroup"])
-            for volume in self.manifest["spec"]["volumes"]
+            volume["name"]: self._volume(volume, security["fsGroup"]) for volume in spec["volumes"]
         }
         mounts = []
         for mount in container["volumeMounts"]:
@@ -72,19 +65,19 @@ class Pod:
         root = self._folder / f"{self.log.stem}-root"
         root.mkdir(exist_ok=True)
         image = os.environ.get(IMAGE_VARIABLE, "")
-        environment = {} if image else {"PYTHONPATH": os.environ.get("PYTHONPATH", "")}
-        environment |= {
+        host, port = self._server.rsplit(":", 1)
+        environment = {
+            "PYTHONPATH": "" if image else os.environ.get("PYTHONPATH", ""),
             "PATH": "/image:/usr/local/bin:/usr/bin:/bin",
-            "KUBERNETES_SERVICE_HOST": self._host,
-            "KUBERNETES_SERVICE_PORT": self._port,
+            "KUBERNETES_SERVICE_HOST": host,
+            "KUBERNETES_SERVICE_PORT": port,
+            **{each["name"]: each["value"] for each in container["env"]},
         }
-        environment |= {each["name"]: each["value"] for each in container["env"]}
         folders = {"/usr", str(ROOT), os.path.realpath(sys.prefix), sys.base_prefix}
         ids = [str(security["runAsUser"]), str(security["runAsGroup"])]
         variables = [f"{name}={value}" for name, value in environment.items()]
         command = [*container["command"], *container["args"]]
-        with self.log.open("ab") as log:
-            self._start = log.tell()
+        with self.log.open("wb") as log:
             self._process = subprocess.Popen(
                 [
                     *launch.command("/usr/bin/unshare", "--mount", "--propagation", "private"),
@@ -98,7 +91,14 @@ class Pod:
 
     def text(self) -> str:
         """Return what the container has printed since its last start."""
-        return self.log.read_bytes()[self._start :].decode(errors="replace")
+        return self.log.read_text(errors="replace")
+
+    def wait_text(self, *texts: str) -> None:
+        def told() -> bool:
+            assert self.code is None, self.text()
+            return any(text in self.text() for text in texts)
+
+        self._kube.wait(f"{' or '.join(texts)} in {self.log}", told)
 
     def kill(self) -> None:
         self._process.kill()
@@ -106,21 +106,17 @@ class Pod:
 
     def _volume(self, volume: dict[str, Any], group: int) -> Path:
         """Return a folder with the content of a volume, readable by the pod's group."""
-        if "persistentVolumeClaim" in volume:
-            folder = self._folder / volume["persistentVolumeClaim"]["claimName"]
-        else:
-            folder = self._folder / f"{self.log.stem}-{volume['name']}"
+        claim = volume.get("persistentVolumeClaim", {}).get("claimName")
+        folder = self._folder / (claim or f"{self.log.stem}-{volume['name']}")
         folder.mkdir(exist_ok=True)
         folder.chmod(0o2775)
         os.chown(folder, 0, group)
-        mode = 0o644
-        if secret := volume.get("secret"):
-            mode = secret["defaultMode"] | 0o440
+        secret = volume.get("secret")
         account = self.manifest["spec"]["serviceAccountName"]
         for name, content in files(self._kube, self._namespace, account, volume).items():
             file = folder / name
             file.unlink(missing_ok=True)
             file.write_bytes(content)
-            file.chmod(mode)
+            file.chmod(secret["defaultMode"] | 0o440 if secret else 0o644)
             os.chown(file, 0, group)
         return folder

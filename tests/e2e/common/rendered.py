@@ -1,32 +1,27 @@
-"""Manifests that golden cases or helm give a cluster."""
+"""Charts: of a state repo, in a new version, and what helm and the API server say of one."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from tests.e2e.rig.cluster import Gitops, Rig
-from tests.e2e.rig.kube import Manifest
-from tests.golden.cases import CASES, whole
+from tests.e2e.rig.cluster import Rig
 
-ARGOCD = "argocd-"  # the prefix of the cases for Argo CD
+from .world import World
+
+_CHARTS, _REGISTRY = "appdefs/object-detection-fusion/charts", "registry/charts.yaml"
+DETECTION_TEMPLATE = f"{_CHARTS}/object-detection/templates/service.yaml"
 
 
-def golden(gitops: Gitops) -> Iterator[Manifest]:
-    seen: set[str] = set()
-    cases = sorted(case for case in CASES if case.startswith(ARGOCD) == (gitops == "argocd"))
-    for folder in ("bootstrap/", "clusters/"):
-        for files in (files for case in cases for files in whole(case).values()):
-            for path in sorted(path for path in files if path.startswith(folder)):
-                for manifest in yaml.safe_load_all(files[path]):
-                    text = json.dumps(manifest, sort_keys=True)
-                    if manifest and text not in seen:
-                        seen.add(text)
-                        yield manifest
+def raised(world: World, name: str, version: str = "99.0.0") -> dict[str, str | None]:
+    """Return the files that give a chart of the skeleton a new version."""
+    file = f"{_CHARTS}/{name}/Chart.yaml"
+    chart, registry = yaml.safe_load(world.file(file)), yaml.safe_load(world.file(_REGISTRY))
+    chart["version"] = registry["charts"][name]["version"] = version
+    return {file: yaml.safe_dump(chart), _REGISTRY: yaml.safe_dump(registry)}
 
 
 def check_chart(

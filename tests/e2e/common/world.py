@@ -1,4 +1,4 @@
-"""A state repo and the generator that writes it.
+"""A state repo, the generator that writes it, and the access domains that clusters run of it.
 
 The generator is a `demandops serve` process that pushes to the rig's Git server by smart HTTP.
 """
@@ -9,80 +9,46 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import pytest
 import yaml
 
-from tests.e2e.argocd.view import Domain as ArgoDomain
-from tests.e2e.flux.view import Domain as FluxDomain
-from tests.e2e.rig import launch
-from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Gitops, Rig
-from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Kube, Manifest
-from tests.e2e.rig.tools import Report
-from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import git
-from tests.kit.ros import Sent
+from tests.kit.repo import Person, git
+from tests.kit.ros import Client, Sent, Served, Servers
 
-from .expected import NAMESPACE, demand
-from .namespace import Namespace
-from .ros import Client
+from .argocd import ArgoDomain
+from .domain import Domain
+from .expected import CLUSTER, NAMESPACE, WITHOUT_DEMANDS, demand
+from .flux import FluxDomain
 
-VIEWS: dict[Gitops, type[Namespace]] = {"flux": FluxDomain, "argocd": ArgoDomain}
-STAGES = ("committed", "pushed", "fetched", "applied", "ready")
-_READY = "taking demands on"
+DOMAINS: dict[Gitops, type[Domain]] = {"flux": FluxDomain, "argocd": ArgoDomain}
 
 
 class Generator:
     def __init__(self, state_repo: str, folder: Path, ros_domain: int, client: Client) -> None:
-        self.log = folder / "generator.log"
-        self._client = client
-        self._folder = folder
-        self._command = ["-m", "demandops.cli.main", "serve", "--state-repo", state_repo]
-        self._environment = environment(folder) | {"ROS_DOMAIN_ID": str(ros_domain)}
-        self._process: subprocess.Popen[bytes] | None = None
+        self._state_repo, self._client = state_repo, client
+        self._servers = Servers(folder, ros_domain, **environment(folder))
+        self._served: Served | None = None
 
     def start(self, *arguments: str) -> None:
-        """Start the generator, which dies with this process; wait until it accepts goals."""
-        command = launch.command(sys.executable, *self._command, *arguments)
-        with self.log.open("ab") as log:
-            start = log.tell()
-            self._process = subprocess.Popen(
-                command, env=self._environment, cwd=self._folder, stdout=log, stderr=log
-            )
-        deadline = time.monotonic() + PATIENCE_S
-        while not (_READY in self._log_since(start) and self._client.reaches_a_node()):
-            ended = self._process.poll() is not None
-            if ended or time.monotonic() > deadline:
-                raise RigError(
-                    f"the generator accepts no demands; {self.log}:\n{self._log_since(start)}"
-                )
-            time.sleep(0.05)
+        """Start the generator; wait until it accepts goals."""
+        self._served = self._servers.start(self._state_repo, *arguments)
+        self._served.wait_for("taking demands on")
+        self._client.ready()
 
     def kill(self) -> None:
-        assert self._process is not None
-        self._process.kill()
-        self._process.wait(10)
+        self._servers.kill()
 
     def stop(self) -> None:
-        """Ask the generator to end, and kill it if it still runs after ten seconds."""
-        if self._process is not None and self._process.poll() is None:
-            self._process.send_signal(signal.SIGTERM)
-            try:
-                self._process.wait(10)
-            except subprocess.TimeoutExpired:
-                self.kill()
-
-    def _log_since(self, offset: int) -> str:
-        return self.log.read_bytes()[offset:].decode(errors="replace")
+        """Ask the generator to end, if it runs."""
+        if self._served is not None and self._served.process.poll() is None:
+            self._served.stop(signal.SIGTERM)
 
 
 class World:
@@ -96,10 +62,16 @@ class World:
         url = rig.git_url(self.name)
         demandops(folder, "init", str(bare), "--bare", "--gitops", rig.gitops, "--url", url)
         git(bare, "push", "--quiet", self.push_url, "main")
-        self.person = Clone(self.push_url, folder / "person")
+        self.person = Person(self.push_url, folder / "person")
         self.generator = Generator(self.push_url, folder, ros_domain, client)
         self.domains: dict[str, Any] = {}
         self._wide: list[tuple[Kube, Manifest]] = []
+
+    def begin(self, rig: Rig) -> None:
+        """Let the cluster follow the state repo, and start the generator."""
+        domain = self.bootstrap(CLUSTER, rig)
+        self.generator.start()
+        domain.wait_lines(WITHOUT_DEMANDS)
 
     def bootstrap(self, cluster: str, rig: Rig, **source: Any) -> Any:
         """Let a cluster follow the state repo, and return the access domain on that cluster.
@@ -111,35 +83,35 @@ class World:
         for item in manifests:
             if item["kind"] == "GitRepository":
                 item["spec"].update(source)
-        (domain,) = VIEWS[rig.gitops].all_in(rig.kube, manifests)
+        (domain,) = self.lay_down(rig, manifests)
         self.domains[cluster] = domain
-        self.apply(rig.kube, manifests)
         domain.settle(self.tip())
         return domain
 
     def manifests(self, cluster: str) -> list[Manifest]:
         return list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
 
-    def apply(self, kube: Kube, manifests: list[Manifest]) -> None:
-        """Apply a bootstrap file's manifests; `remove_wide` removes those that are cluster-wide."""
-        kube.apply(*manifests)
+    def lay_down(self, rig: Rig, manifests: list[Manifest]) -> list[Any]:
+        """Apply a bootstrap file's manifests; return the access domains that they lay down.
+
+        `remove` also removes what is cluster-wide of them, but no namespace.
+        """
+        rig.kube.apply(*manifests)
         self._wide += [
-            (kube, item)
+            (rig.kube, item)
             for item in manifests
             if "namespace" not in item["metadata"] and item["kind"] != "Namespace"
         ]
-
-    def remove_wide(self) -> None:
-        for kube, item in self._wide:
-            kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
-        self._wide.clear()
+        return [one for kind in DOMAINS.values() for one in kind.all_in(rig.kube, manifests)]
 
     def remove(self) -> None:
         """Stop the generator and remove the state repo's objects; the namespaces stay."""
         self.generator.stop()
         for domain in self.domains.values():
             domain.remove()
-        self.remove_wide()
+        for kube, item in self._wide:
+            kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
+        self._wide.clear()
         self.domains.clear()
 
     @property
@@ -149,91 +121,74 @@ class World:
         return only
 
     def file(self, path: str) -> str:
-        self._pull()
+        self.person.fetch()
         return (self.person.folder / path).read_text()
 
+    def git(self, *arguments: str) -> str:
+        """Run git in a clone that has the newest commit."""
+        self.person.fetch()
+        return git(self.person.folder, *arguments)
+
     def tip(self) -> str:
-        self._pull()
-        return self.person.git("rev-parse", "HEAD")
+        return self.git("rev-parse", "HEAD")
 
     def changed_by(self, commit: str) -> list[str]:
-        self._pull()
-        return self.person.git("show", "--name-only", "--format=", commit).split()
+        return self.git("show", "--name-only", "--format=", commit).split()
 
     def commits_since(self, commit: str) -> int:
-        self._pull()
-        return int(self.person.git("rev-list", "--count", f"{commit}..HEAD"))
+        return int(self.git("rev-list", "--count", f"{commit}..HEAD"))
 
     def push(self, files: Mapping[str, str | None], message: str = "by hand") -> str:
         """Commit and push files as a person would; try again if the generator pushed first."""
         while True:
-            self._pull()
             try:
                 return self.person.push(files, message)
             except AssertionError as error:
                 if "[rejected]" not in str(error):
                     raise
 
+    def demandops(self, command: str, *arguments: str, or_exit: int = 0) -> str:
+        """Run a command on the state repo, which may exit with `or_exit`; return its output."""
+        words = (command, "--state-repo", self.push_url, *arguments)
+        return demandops(self.folder, *words, or_exit=or_exit)
+
+    def upgrade(self, gitops: Gitops | None = None) -> str:
+        """Render the state repo anew, or for another controller; return the new commit."""
+        self.demandops("upgrade", *(("--gitops", gitops) if gitops else ()))
+        return self.tip()
+
     def demand(self, goal: dict[str, Any]) -> Sent:
         """Send a goal, check that it succeeds, and return it with its answer."""
+        self.client.ready()
         sent = self.client.call(goal)
         assert sent.status == "succeeded", sent.message
         return sent
 
-    def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> list[float]:
-        """Send the goal of a step, then `follow` the goal."""
-        return self.follow(self.demand(demand(number)), wanted, wake=wake)
+    def step(self, number: int, wanted: frozenset[str]) -> None:
+        """Send the goal of a step, and `follow` it."""
+        self.follow(self.demand(demand(number)), wanted)
 
-    def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> list[float]:
-        """Wait until the cluster has applied a goal's commit, and its `lines` are as wanted.
-
-        Return when the goal was sent, and when it reached each of :data:`STAGES`. With `wake`,
-        trigger the controller first.
-        """
-        domain = self.domain
-        if wake:
-            domain.wake()
-        fetched = domain.wait_fetched(sent.commit)
-        applied = domain.wait_applied(sent.commit)
-        ready = domain.wait_lines(wanted)
-        pushed = sent.stages["pushed"]
-        committed = sent.stages.get("committed", pushed)  # no commit if nothing changed
-        return [sent.at, committed, pushed, fetched, applied, ready]
-
-    def _pull(self) -> None:
-        self.person.git("fetch", "--quiet", "origin", "main")
-        self.person.git("reset", "--quiet", "--hard", "FETCH_HEAD")
-
-
-def show_times(say: Report, heading: str, rows: Mapping[str, list[float]]) -> None:
-    """Print how long each demand took to each stage; `rows` has results of :meth:`World.follow`."""
-    width = max(map(len, rows))
-    say(f"\n{heading} (seconds)")
-    say(" " * (width + 2) + "".join(f"{stage:>11}" for stage in (*STAGES, "in all")))
-    for title, at in rows.items():
-        taken = [*(after - before for before, after in pairwise(at)), at[-1] - at[0]]
-        say(f"  {title:<{width}}" + "".join(f"{value:11.2f}" for value in taken))
+    def follow(self, sent: Sent, wanted: frozenset[str]) -> None:
+        """Wait until the cluster has applied a goal's commit, and its `lines` are as wanted."""
+        self.domain.follow(sent.commit)
+        self.domain.wait_lines(wanted)
 
 
 @contextmanager
-def running(rig: Rig, session: pytest.Session) -> Iterator[Rig]:
-    """Start a rig and stop it after the block; keep its logs if a test failed meanwhile."""
-    failed = session.testsfailed
-    rig.start()
-    try:
+def running(rig: Rig) -> Iterator[Rig]:
+    """Start a rig and stop it after the block; what the tests created in a cluster goes."""
+    with rig:
         yield rig
-    finally:
         if rig.existing:
             rig.kube.delete("Namespace", NAMESPACE)
-        rig.stop(failed=session.testsfailed > failed)
 
 
-def demandops(folder: Path, *arguments: str) -> str:
+def demandops(folder: Path, *arguments: str, or_exit: int = 0) -> str:
     command = [sys.executable, "-m", "demandops.cli.main", *arguments]
     done = subprocess.run(
         command, env=environment(folder), cwd=folder, capture_output=True, text=True, check=False
     )
-    assert done.returncode == 0, f"demandops {' '.join(arguments)}: {done.stderr}"
+    assert done.returncode in (0, or_exit), f"demandops {' '.join(arguments)}: {done.stderr}"
     return done.stdout
 
 

@@ -1,6 +1,6 @@
 """A cluster with Flux or Argo CD, fake nodes and a Git server.
 
-    with Rig("edge", nodes=["edge"]) as rig:
+    with Rig("edge", folder, nodes=["edge"]) as rig:
         rig.kube.apply(...)
 
 Only this module knows the order in which the parts start. If the environment names an existing
@@ -13,21 +13,24 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from . import githttp, kwok, pki, settings, tools
+import pytest
+
+from . import RigError, githttp, pki, settings, tools
 from .components import KINDS, Components, prerequisites
-from .errors import RigError
-from .kube import Kube
+from .kube import Kube, Manifest, build_manifest
 from .net import answers, free_port, url
 from .processes import Component, Processes
-from .workdir import Workdir
-
-KEEP_VARIABLE = "E2E_KEEP"
 
 Gitops = Literal["flux", "argocd"]
+
+NODE_ID_LABEL = "node_id"  # releases select nodes by it
+_CAPACITY = {"cpu": "64", "memory": "256Gi", "ephemeral-storage": "1Ti", "pods": "1000"} | {
+    "nvidia.com/gpu": "8"
+}
 
 
 class Rig:
@@ -35,6 +38,7 @@ class Rig:
 
     Args:
         name: the rig's name, as in E2E_KUBECONFIG_<NAME>.
+        folder: what it keeps: data, logs, and the repositories of its Git server.
         gitops: the GitOps controller.
         beside: a second GitOps controller.
         nodes: the ids of the nodes.
@@ -48,7 +52,8 @@ class Rig:
 
     def __init__(
         self,
-        name: str = "rig",
+        name: str,
+        folder: Path,
         *,
         gitops: Gitops = "flux",
         beside: Gitops | None = None,
@@ -56,30 +61,25 @@ class Rig:
         git_of: Rig | None = None,
         report: tools.Report | None = None,
     ) -> None:
-        self.name, self.gitops = name, gitops
+        self.name, self.gitops, self._folder = name, gitops, folder
         self._controllers = tuple(dict.fromkeys([gitops, beside or gitops]))
         self.existing = settings.existing(name)
-        self._git_of, self._report = git_of, report
-        self._nodes = [kwok.manifest(node_id) for node_id in nodes]
+        self._report = report
+        self._repositories = (git_of or self)._folder / "git"
+        self._nodes = [_fake_node(node_id) for node_id in nodes]
         self._binaries: dict[str, Path] = {}
-        self._work: Workdir | None = None
-        self.parts: Any = None
-        """The processes of a cluster that this rig has started."""
         self._git_url = self._push_url = ""
+        self._parts: Processes | None = None
+
+    @property
+    def parts(self) -> Processes:
+        """The programs of the cluster; a test that needs them skips one that is not the rig's."""
+        if self._parts is None:
+            pytest.skip("the tests do not touch the programs of an existing cluster")
+        return self._parts
 
     def __enter__(self) -> Rig:
-        self.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.stop(failed=kind is not None)
-
-    # --- start and stop ---------------------------------------------------------------------
-
-    def start(self) -> None:
         """Start everything and wait until it is ready; stop everything on failure."""
-        if self._work is not None:
-            raise RigError(f"rig {self.name}: already started; stop it first")
         try:
             if self.existing:
                 self._adopt(self.existing)
@@ -88,31 +88,29 @@ class Rig:
             self.kube.apply(*self._nodes)
             for node in self._nodes:
                 self.kube.wait_ready("Node", node["metadata"]["name"])
-        except BaseException as error:  # also after an interrupt
-            self.stop(failed=isinstance(error, Exception))
+        except BaseException:  # also after an interrupt
+            self.stop()
             raise
+        return self
 
-    def stop(self, *, failed: bool = False) -> None:
-        """Stop everything; keep the logs if `failed`. A second call is allowed."""
-        work, processes, kube = self._work, self.parts, getattr(self, "kube", None)
-        try:
-            if kube is not None and self.existing:
-                for node in self._nodes:  # a cluster that the rig started goes as a whole
-                    kube.delete("Node", node["metadata"]["name"])
-            if kube is not None:
-                kube.close()
-        finally:
-            self._work = self.parts = None
-            if processes is not None:
-                processes.stop_all()
-            if work is not None:
-                self._clear(work, failed)
+    def __exit__(self, *_: object) -> None:
+        if self.existing:
+            for node in self._nodes:  # a cluster that the rig started goes as a whole
+                self.kube.delete("Node", node["metadata"]["name"])
+        self.stop()
 
-    def check(self) -> None:
-        if self.parts is not None:
-            self.parts.check()
+    def stop(self) -> None:
+        if hasattr(self, "kube"):
+            self.kube.close()
+        if self._parts:
+            self._parts.stop_all()
 
     # --- what tests use ---------------------------------------------------------------------
+
+    def check(self) -> None:
+        """Raise RigError if a part has ended by itself."""
+        if self._parts:
+            self._parts.check()
 
     def git_url(self, repository: str) -> str:
         return f"{self._git_url}/{repository}"
@@ -122,18 +120,15 @@ class Rig:
         return f"{self._push_url}/{repository}"
 
     def repository(self, name: str) -> Path:
-        work = (self._git_of or self)._work
-        assert work is not None and not self.existing
-        return work.repositories / name
+        assert not self.existing
+        return self._repositories / name
 
     def helm(self, *arguments: str) -> str:
-        helm = self.helm_program()
         # The kubeconfig of an existing cluster may call a login command that needs the environment.
-        clean = self._work.environment() if self._work and not self.existing else dict(os.environ)
+        clean = dict(os.environ) if self.existing else self._environment()
         environment = clean | {"KUBECONFIG": str(self.kubeconfig)}
-        done = subprocess.run(
-            [str(helm), *arguments], env=environment, capture_output=True, text=True, check=False
-        )
+        command = [str(self.helm_program()), *arguments]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise RigError(f"helm {' '.join(arguments)}: {done.stderr.strip()}")
         return done.stdout
@@ -150,8 +145,7 @@ class Rig:
     def _adopt(self, existing: settings.Existing) -> None:
         self.kubeconfig = existing.kubeconfig
         self._git_url, self._push_url = existing.git_url, existing.push_url
-        work = self._work = Workdir(self.name)
-        self.kube = Kube(existing.kubeconfig, work.path / "discovery.json")
+        self.kube = Kube(existing.kubeconfig, self._folder / "discovery.json")
         for kind in (kind for controller in self._controllers for kind in KINDS[controller]):
             try:
                 self.kube.find(kind)
@@ -161,15 +155,16 @@ class Rig:
 
     def _start_own(self) -> None:
         self._binaries = tools.ensure(tools.needed_with(*self._controllers), self._report)
-        work = self._work = Workdir(self.name)
-        running = self.parts = Processes(work.logs, work.environment())
-        certificates = pki.make(work.path / "pki")
-        parts = Components(self._binaries, work.path, certificates)
-        running.start_together([*parts.of("store"), self._git()])
+        folder, port = self._folder, free_port()
+        self._git_url = self._push_url = url(port)
+        running = self._parts = Processes(folder / "logs", self._environment())
+        certificates = pki.make(folder / "pki")
+        parts = Components(self._binaries, folder, certificates)
+        running.start_together([*parts.of("store"), git_server("git", self._repositories, port)])
         running.start_together(parts.of("api"))
         self.kubeconfig, server = parts["kubeconfig"], url(parts["api_port"], "https")
         pki.write_kubeconfig(self.kubeconfig, self.name, server, certificates)
-        self.kube = Kube(self.kubeconfig, work.path / "discovery.json", self.check)
+        self.kube = Kube(self.kubeconfig, folder / "discovery.json", self.check)
         self.kube.install_crds(tools.crd_files(self._binaries))
         started = [*parts.of("control")]
         for controller in self._controllers:
@@ -180,19 +175,38 @@ class Rig:
         account = ("ServiceAccount", "default", "default")
         self.kube.wait("the default service account", lambda: self.kube.get(*account))
 
-    def _git(self) -> Component:
-        port = free_port()
-        self._git_url = self._push_url = url(port)
-        argv = [sys.executable, "-I", "-S", githttp.__file__]
-        argv += ["--root", str(self.repository("")), "--port", str(port)]
-        return Component("git", tuple(argv), answers(port, githttp.HEALTH))
+    def _environment(self) -> dict[str, str]:
+        """Return the environment of the rig's processes, which read no file of the user."""
+        home, temporary = self._folder / "home", self._folder / "tmp"
+        for place in (home, temporary):
+            place.mkdir(exist_ok=True)
+        return {
+            "PATH": os.environ.get("PATH", os.defpath),
+            "HOME": str(home),
+            "TMPDIR": str(temporary),
+            "NO_PROXY": "127.0.0.1,localhost",
+        }
 
-    # --- inside -----------------------------------------------------------------------------
 
-    def _clear(self, work: Workdir, failed: bool) -> None:
-        if os.environ.get(KEEP_VARIABLE):
-            print(f"rig {self.name}: kept {work.path}", file=sys.stderr)
-            return
-        work.clear(keep_logs=failed)
-        if failed and not self.existing:
-            print(f"rig {self.name}: logs are in {work.logs}", file=sys.stderr)
+def git_server(
+    name: str, root: Path, port: int, environment: Mapping[str, str] | None = None
+) -> Component:
+    arguments = ("--root", str(root), "--port", str(port))
+    argv = (sys.executable, "-I", "-S", githttp.__file__, *arguments)
+    return Component(name, argv, answers(port, githttp.HEALTH), environment or {})
+
+
+def _fake_node(node_id: str) -> Manifest:
+    """Return a node that kwok reports as running, with its pods; the annotation says so."""
+    status = {"capacity": _CAPACITY, "allocatable": _CAPACITY}
+    made = build_manifest("v1", "Node", node_id, status=status)
+    made["metadata"] |= {
+        "labels": {
+            "kubernetes.io/hostname": node_id,
+            "kubernetes.io/os": "linux",
+            "type": "kwok",
+            NODE_ID_LABEL: node_id,
+        },
+        "annotations": {"kwok.x-k8s.io/node": "fake", "node.alpha.kubernetes.io/ttl": "0"},
+    }
+    return made

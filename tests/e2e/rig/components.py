@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from .errors import RigError
+from . import RigError
 from .kube import Manifest, build_manifest
 from .net import accepts, answers, free_port
 from .pki import Pki

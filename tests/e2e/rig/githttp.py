@@ -13,7 +13,6 @@ import base64
 import contextlib
 import hmac
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -52,28 +51,26 @@ class GitServer(ThreadingHTTPServer):
         self.expected = ""
         if user and password:
             self.expected = "Basic " + base64.b64encode(f"{user}:{password}".encode()).decode()
-        program = shutil.which("git")
-        if program is None:
-            raise SystemExit("`git` is not on PATH: install Git")
-        self.git = program
+        self.environment = {
+            "PATH": os.environ.get("PATH", os.defpath),
+            "HOME": str(self.root),
+            "GIT_CONFIG_NOSYSTEM": "1",
+            "GIT_CONFIG_GLOBAL": os.devnull,
+            "GIT_HTTP_EXPORT_ALL": "1",
+            "GIT_PROJECT_ROOT": str(self.root),
+            "GIT_CONFIG_COUNT": str(len(_CONFIGURATION)),
+        }
+        for number, (key, value) in enumerate(_CONFIGURATION.items()):
+            setting = {f"GIT_CONFIG_KEY_{number}": key, f"GIT_CONFIG_VALUE_{number}": value}
+            self.environment |= setting
 
-    def environment(self) -> dict[str, str]:
-        return _environment(self.root)
-
-
-def _environment(root: Path) -> dict[str, str]:
-    settings = {"GIT_CONFIG_COUNT": str(len(_CONFIGURATION))}
-    for number, (key, value) in enumerate(_CONFIGURATION.items()):
-        settings |= {f"GIT_CONFIG_KEY_{number}": key, f"GIT_CONFIG_VALUE_{number}": value}
-    return {
-        "PATH": os.environ.get("PATH", os.defpath),
-        "HOME": str(root),
-        "GIT_CONFIG_NOSYSTEM": "1",
-        "GIT_CONFIG_GLOBAL": os.devnull,
-        "GIT_HTTP_EXPORT_ALL": "1",
-        "GIT_PROJECT_ROOT": str(root),
-        **settings,
-    }
+    def git(self, *arguments: str, sent: bytes = b"", **variables: str) -> bytes:
+        command = ["git", *arguments]
+        environment = self.environment | variables
+        done = subprocess.run(
+            command, env=environment, input=sent, stdout=subprocess.PIPE, check=False
+        )
+        return bytes(done.stdout)
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -84,23 +81,24 @@ class Handler(BaseHTTPRequestHandler):
         self.close_connection = True  # this tells the client where the answer ends
         path, _, query = self.path.partition("?")
         path = unquote(path)
+        given = self.headers.get("Authorization", "").encode()
+        expected = self.server.expected.encode()
         if path == HEALTH:
             self._answer(HTTPStatus.OK, "serving")
-        elif not self._allowed():
+        elif expected and not hmac.compare_digest(given, expected):
             self._answer(HTTPStatus.UNAUTHORIZED, "give a user and a password")
         elif ".." in PurePosixPath(path).parts:
             self._answer(HTTPStatus.BAD_REQUEST, "the path contains '..'; remove it")
         else:
-            self._create_for_push(path, query)
+            name = path.removesuffix("/info/refs")
+            pushing = parse_qs(query).get("service") == ["git-receive-pack"]
+            repository = self.server.root / name.strip("/")
+            if name != path and pushing and name.endswith(".git") and not repository.exists():
+                options = ("--quiet", "--bare", "--initial-branch=main")
+                self.server.git("init", *options, str(repository))
             self.run_backend(path, query)
 
     do_GET = do_POST = serve
-
-    def _allowed(self) -> bool:
-        given = self.headers.get("Authorization", "")
-        return hmac.compare_digest(given.encode(), self.server.expected.encode()) or (
-            not self.server.expected
-        )
 
     def _answer(self, status: HTTPStatus, text: str) -> None:
         body = f"{text}\n".encode()
@@ -113,44 +111,27 @@ class Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
-    def _create_for_push(self, path: str, query: str) -> None:
-        name = path.removesuffix("/info/refs")
-        pushing = parse_qs(query).get("service") == ["git-receive-pack"]
-        repository = self.server.root / name.strip("/")
-        if name != path and pushing and name.endswith(".git") and not repository.exists():
-            init_bare(repository, self.server.git)
-
     def run_backend(self, path: str, query: str) -> None:
         try:
             sent = b"".join(self.body())
         except (OSError, ValueError) as error:
             self.log_error("request body: %s", error)
             return
-        environment = self.server.environment() | self._request_variables(path, query)
-        done = subprocess.run(
-            [self.server.git, "http-backend"],
-            env=environment,
-            input=sent,
-            stdout=subprocess.PIPE,
-            check=False,
-        )
-        with contextlib.suppress(OSError):  # the client may have gone
-            self._relay(done.stdout)
-
-    def _request_variables(self, path: str, query: str) -> dict[str, str]:
-        headers = self.headers
         variables = {
             "REQUEST_METHOD": self.command,
             "PATH_INFO": path,
             "QUERY_STRING": query,
             "REMOTE_ADDR": str(self.client_address[0]),
             "SERVER_PROTOCOL": self.request_version,
-            "CONTENT_TYPE": headers.get("Content-Type", ""),
-            "HTTP_CONTENT_ENCODING": headers.get("Content-Encoding", ""),
-            "GIT_PROTOCOL": headers.get("Git-Protocol", ""),
-            "CONTENT_LENGTH": headers.get("Content-Length", ""),
+            "CONTENT_TYPE": self.headers.get("Content-Type", ""),
+            "HTTP_CONTENT_ENCODING": self.headers.get("Content-Encoding", ""),
+            "GIT_PROTOCOL": self.headers.get("Git-Protocol", ""),
+            "CONTENT_LENGTH": self.headers.get("Content-Length", ""),
         }
-        return {name: value for name, value in variables.items() if value}
+        given = {name: value for name, value in variables.items() if value}
+        answer = self.server.git("http-backend", sent=sent, **given)
+        with contextlib.suppress(OSError):  # the client may have gone
+            self._relay(answer)
 
     def body(self) -> Iterator[bytes]:
         if "chunked" in self.headers.get("Transfer-Encoding", "").lower():  # packs above 1 MB
@@ -172,30 +153,15 @@ class Handler(BaseHTTPRequestHandler):
 
     def _relay(self, answer: bytes) -> None:
         head, _, body = answer.partition(b"\r\n\r\n")
-        status, headers = HTTPStatus.OK.value, []
-        for line in head.decode("latin-1").splitlines():
-            name, _, value = line.partition(":")
-            if name.lower() == "status":
-                status = int(value.split()[0])
-            else:
-                headers.append((name, value.strip()))
-        if not headers:
+        if not head:
             self._answer(HTTPStatus.BAD_GATEWAY, "git http-backend sent no answer; see the log")
             return
-        self.send_response(status)
-        for name, value in [*headers, ("Connection", "close")]:
+        headers = dict(line.split(": ", 1) for line in head.decode("latin-1").splitlines())
+        self.send_response(int(headers.pop("Status", "200").split()[0]))
+        for name, value in {**headers, "Connection": "close"}.items():
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)
-
-
-def init_bare(repository: Path, git: str = "git") -> None:
-    repository.parent.mkdir(parents=True, exist_ok=True)
-    subprocess.run(
-        [git, "init", "--quiet", "--bare", "--initial-branch=main", str(repository)],
-        check=True,
-        env=_environment(repository.parent),
-    )
 
 
 def _main() -> None:

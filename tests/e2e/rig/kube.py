@@ -24,7 +24,7 @@ from urllib3.exceptions import HTTPError
 
 from tests.kit.limits import PATIENCE_S
 
-from .errors import RigError
+from . import RigError
 
 Manifest = dict[str, Any]
 Seen = TypeVar("Seen")

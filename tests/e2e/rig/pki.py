@@ -1,25 +1,34 @@
-"""Certificates and keys of a rig's control plane, created for each rig.
+"""Certificates and keys of a rig's control plane, made by openssl for each rig.
 
 One authority signs the certificates of the servers and of the administrator. The keys are
-elliptic-curve keys, because these are created fast. Only the owner of the files can read the
-private keys.
+elliptic-curve keys, because these are made fast.
 """
 
 from __future__ import annotations
 
 import base64
-import datetime
-import ipaddress
 import json
+import subprocess
 from pathlib import Path
 
-from cryptography import x509
-from cryptography.hazmat.primitives import hashes, serialization
-from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-
-_LIFE = datetime.timedelta(days=30)
-_AUTHORITY = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rig-authority")])
+_CURVE = ("-pkeyopt", "ec_paramgen_curve:P-256")
+_EXTENSIONS = """
+[req]
+distinguished_name = subject
+[subject]
+[authority]
+basicConstraints = critical, CA:TRUE
+keyUsage = critical, digitalSignature, keyCertSign, cRLSign
+subjectKeyIdentifier = hash
+[signed]
+basicConstraints = critical, CA:FALSE
+keyUsage = critical, digitalSignature
+extendedKeyUsage = serverAuth, clientAuth
+subjectAltName = DNS:localhost, IP:127.0.0.1
+# Python 3.13 and later refuse a server whose certificate lacks these two extensions.
+subjectKeyIdentifier = hash
+authorityKeyIdentifier = keyid
+"""
 
 
 class Pki:
@@ -34,32 +43,31 @@ class Pki:
 
 def make(folder: Path) -> Pki:
     """Create the certificates and keys of a control plane, and write them into a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths, authority = Pki(folder), ec.generate_private_key(ec.SECP256R1())
-    root = _builder(_AUTHORITY, authority.public_key(), authority)
-    _write(paths.authority, _signed(root, authority))
-    server, admin, accounts = (ec.generate_private_key(ec.SECP256R1()) for _ in range(3))
-    addresses = x509.SubjectAlternativeName(
-        [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
-    )
-    request = _builder(_name("rig-server"), server.public_key(), authority)
-    request = request.add_extension(addresses, critical=False)
-    _write(paths.server_certificate, _signed(request, authority))
+    folder.mkdir(parents=True)
+    paths, signer = Pki(folder), folder / "ca.key"
+    (folder / "openssl.cnf").write_text(_EXTENSIONS)
+
+    def certify(subject: str, certificate: Path, key: Path, *signed_by: Path) -> None:
+        options = ["-config", folder / "openssl.cnf", "-days", "30", "-subj", subject]
+        if signed_by:
+            options += ["-extensions", "signed", "-CA", signed_by[0], "-CAkey", signed_by[1]]
+        else:
+            options += ["-extensions", "authority"]
+        output = ("-noenc", "-keyout", key, "-out", certificate)
+        _openssl("req", "-x509", "-newkey", "ec", *_CURVE, *options, *output)
+
+    by = (paths.authority, signer)
+    certify("/CN=rig-authority", *by)
+    certify("/CN=rig-server", paths.server_certificate, paths.server_key, *by)
     # Each cluster makes the group system:masters administrators from the start.
-    request = _builder(_name("rig-admin", "system:masters"), admin.public_key(), authority)
-    _write(paths.admin_certificate, _signed(request, authority))
-    keys = {paths.server_key: server, paths.admin_key: admin, paths.account_private: accounts}
-    for path, key in keys.items():
-        encoding, form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
-        _write(path, key.private_bytes(encoding, form, serialization.NoEncryption()))
-    public = serialization.PublicFormat.SubjectPublicKeyInfo
-    _write(
-        paths.account_public, accounts.public_key().public_bytes(serialization.Encoding.PEM, public)
-    )
+    admin = "/O=system:masters/CN=rig-admin"
+    certify(admin, paths.admin_certificate, paths.admin_key, *by)
+    _openssl("genpkey", "-algorithm", "EC", *_CURVE, "-out", paths.account_private)
+    _openssl("pkey", "-in", paths.account_private, "-pubout", "-out", paths.account_public)
     return paths
 
 
-def write_kubeconfig(target: Path, name: str, server: str, pki: Pki) -> Path:
+def write_kubeconfig(target: Path, name: str, server: str, pki: Pki) -> None:
     """Write an administrator's kubeconfig with all certificates, as JSON, which is YAML."""
 
     def inline(path: Path) -> str:
@@ -78,50 +86,9 @@ def write_kubeconfig(target: Path, name: str, server: str, pki: Pki) -> Path:
         "users": [{"name": name, "user": user}],
         "contexts": [{"name": name, "context": {"cluster": name, "user": name}}],
     }
-    return _write(target, json.dumps(content, indent=2).encode())
+    target.touch(mode=0o600)
+    target.write_text(json.dumps(content, indent=2))
 
 
-def _builder(
-    subject: x509.Name, key: ec.EllipticCurvePublicKey, authority: ec.EllipticCurvePrivateKey
-) -> x509.CertificateBuilder:
-    now = datetime.datetime.now(datetime.timezone.utc)
-    ca = subject == _AUTHORITY
-    signer = authority.public_key()
-    unused = ("content_commitment", "data_encipherment", "key_agreement")
-    never = dict.fromkeys((*unused, "key_encipherment", "encipher_only", "decipher_only"), False)
-    usage = x509.KeyUsage(digital_signature=True, key_cert_sign=ca, crl_sign=ca, **never)
-    builder = (
-        x509.CertificateBuilder()
-        .subject_name(subject)
-        .issuer_name(_AUTHORITY)
-        .public_key(key)
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(minutes=5))  # a clock may be set back
-        .not_valid_after(now + _LIFE)
-        .add_extension(x509.BasicConstraints(ca=ca, path_length=None), critical=True)
-        .add_extension(usage, critical=True)
-        # Python 3.13 and later refuse a server whose certificate lacks these two extensions.
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer), critical=False)
-    )
-    if ca:
-        return builder
-    usages = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
-    return builder.add_extension(x509.ExtendedKeyUsage(usages), critical=False)
-
-
-def _signed(request: x509.CertificateBuilder, authority: ec.EllipticCurvePrivateKey) -> bytes:
-    return request.sign(authority, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
-
-
-def _name(common: str, organisation: str | None = None) -> x509.Name:
-    attributes = [x509.NameAttribute(NameOID.COMMON_NAME, common)]
-    if organisation:
-        attributes.append(x509.NameAttribute(NameOID.ORGANIZATION_NAME, organisation))
-    return x509.Name(attributes)
-
-
-def _write(path: Path, content: bytes) -> Path:
-    path.touch(mode=0o600)
-    path.write_bytes(content)
-    return path
+def _openssl(*arguments: str | Path) -> None:
+    subprocess.run(["openssl", *map(str, arguments)], check=True, capture_output=True)

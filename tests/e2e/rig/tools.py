@@ -1,10 +1,14 @@
 """Build the rig's programs from pinned Go modules, once, into a cache outside the checkout.
 
 The other modules of the rig take the paths that `ensure` returns. Each program is pinned by a Go
-module of its own under `tests/e2e/tools/`, whose `go.sum` covers all dependencies.
+module of its own under `tests/e2e/tools/`, its wrapper, whose `go.sum` covers all dependencies.
 
 The name of a cache entry is a digest of everything that decides the program's bytes. A finished
 entry is renamed into the cache, so each existing entry is complete.
+
+A build follows the committed `go.mod` and `go.sum`, and ignores the caller's Go settings. It uses
+the installed Go and fetches no toolchain. It runs at the lowest priority, because a build with an
+empty cache uses two cores for about twenty minutes.
 
 `python -m tests.e2e.rig.tools` builds all programs. With `--for flux` it builds the programs of a
 rig with Flux.
@@ -19,23 +23,27 @@ import json
 import os
 import re
 import shutil
+import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from . import gobuild
-from .errors import RigError
+from . import RigError, launch
 
 WRAPPERS = Path(__file__).resolve().parent.parent / "tools"
 CACHE_VARIABLE = "DEMANDOPS_E2E_CACHE"
+_BUILDING = ".building-"
 
 Report = Callable[[str], None]
 
 _ARGOCD = "github.com/argoproj/argo-cd/v3"
 _CRD_FOLDERS = ("config/crd/bases", "manifests/crds")  # Flux's, Argo CD's
+_SHOWN_LINES = 40
+_PACKAGES_AT_ONCE = 400
 
 
 @dataclass(frozen=True)
@@ -78,19 +86,21 @@ TOOLS = {
 
 def ensure(names: Iterable[str], report: Report | None = None) -> dict[str, Path]:
     """Return the paths of these programs, after building what the cache lacks; raise RigError."""
-    wanted, say = list(names), report or _to_stderr
-    go = gobuild.Go.find()
-    entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], go)}" for name in wanted}
-    missing = [name for name in wanted if not entries[name].is_dir()]
-    for place, name in enumerate(missing, start=1):
+    wanted, say = [TOOLS[name] for name in names], report or _to_stderr
+    if shutil.which("go") is None:
+        raise RigError("tests/e2e/tools: `go` is not on PATH: `make go` installs it into build/")
+    version, *target = _go(Path("/"), {}, "env", "GOVERSION", "GOOS", "GOARCH").splitlines()
+    entries = {
+        tool: cache_root() / f"{tool.name}-{_digest(tool, version, target)}" for tool in wanted
+    }
+    if not all(entry.is_dir() for entry in entries.values()):
         with _turn(cache_root(), say):
-            if not entries[name].is_dir():  # another run may have built it while we waited
-                workspace = gobuild.Workspace(cache_root() / f".go-{TOOLS[name].wrapper}")
-                say(f"building program {place} of {len(missing)}, {name}")
-                _build(TOOLS[name], go, entries[name], workspace, say)
-                if TOOLS[name].wrapper not in [TOOLS[other].wrapper for other in missing[place:]]:
-                    workspace.remove()
-    return {name: entries[name] / name for name in wanted}
+            # another run may have built some while we waited
+            missing = [tool for tool in wanted if not entries[tool].is_dir()]
+            for wrapper, tools in groupby(missing, lambda tool: tool.wrapper):
+                with TemporaryDirectory(prefix=_BUILDING, dir=cache_root()) as workspace:
+                    _build(Path(workspace), WRAPPERS / wrapper, {t: entries[t] for t in tools}, say)
+    return {tool.name: entry / tool.name for tool, entry in entries.items()}
 
 
 def needed_with(*gitops: str) -> list[str]:
@@ -104,20 +114,18 @@ def crd_files(binaries: dict[str, Path]) -> list[Path]:
 
 
 def cache_root() -> Path:
-    named = os.environ.get(CACHE_VARIABLE)
-    if named:
-        return Path(named).expanduser().resolve()
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser().resolve() / "demandops" / "e2e"
+    named = os.environ.get(CACHE_VARIABLE) or f"{base}/demandops/e2e"
+    return Path(named).expanduser().resolve()
 
 
-def _digest(tool: Tool, go: gobuild.Go) -> str:
+def _digest(tool: Tool, version: str, target: list[str]) -> str:
     """Return a digest of what decides a program's bytes: pins, flags, toolchain and target."""
-    folder = WRAPPERS / tool.wrapper
+    folder, built = WRAPPERS / tool.wrapper, [version, "/".join(target)]
     parts = [
         (folder / "go.mod").read_bytes(),
         (folder / "go.sum").read_bytes(),
-        json.dumps([tool.package, tool.crds_of, _flags(tool), go.version, go.target]).encode(),
+        json.dumps([tool.package, tool.crds_of, _flags(tool), *built]).encode(),
     ]
     joined = b"\0".join(hashlib.sha256(part).digest() for part in parts)
     return hashlib.sha256(joined).hexdigest()[:16]
@@ -148,31 +156,48 @@ def _turn(root: Path, say: Report) -> Iterator[None]:
         except BlockingIOError:
             say(f"another run is building into {root}, waiting for it")
             fcntl.flock(lock, fcntl.LOCK_EX)
-        for leftover in root.glob(".building-*"):  # only of killed builds, as we hold the lock
+        for leftover in root.glob(f"{_BUILDING}*"):  # only of killed builds, as we hold the lock
             shutil.rmtree(leftover, ignore_errors=True)
         yield
 
 
-def _build(
-    tool: Tool, go: gobuild.Go, entry: Path, workspace: gobuild.Workspace, say: Report
-) -> None:
-    staging = Path(tempfile.mkdtemp(prefix=f".building-{tool.name}-", dir=entry.parent))
-    try:
-        start, wrapper, binary = time.monotonic(), WRAPPERS / tool.wrapper, staging / tool.name
-        go.check(wrapper)
-        say("fetching modules")
-        workspace.vendor(go, wrapper)
+def _build(workspace: Path, wrapper: Path, entries: dict[Tool, Path], say: Report) -> None:
+    """Build programs of one wrapper in a folder that goes afterwards.
+
+    The modules of all wrappers and their compiled packages would fill about 15 GB. So a workspace
+    has only the sources that its wrapper builds, in a vendor folder.
+    """
+    module, own = workspace / "wrapper", {"GOCACHE": "compiled", "GOMODCACHE": "modules"}
+    own = {name: str(workspace / folder) for name, folder in own.items()}
+
+    def go(*arguments: str) -> str:
+        return _go(module, own | {"GOTMPDIR": str(workspace)}, *arguments)
+
+    say(f"fetching modules for {', '.join(tool.name for tool in entries)}")
+    shutil.copytree(wrapper, module)
+    go("mod", "vendor", "-o", "fetched")  # this compares the sources with `go.sum`
+    (module / "fetched").rename(module / "vendor")
+    for tool in entries:
+        (workspace / tool.name).mkdir()
         if tool.crds_of:
-            _copy_crds(Path(gobuild.module_folder(go, workspace, tool.crds_of)), staging / "crds")
-        workspace.drop_modules()
-        gobuild.build(go, tool.package, _flags(tool), binary, workspace, say)
+            unpacked = json.loads(go("mod", "download", "-json", tool.crds_of))
+            _copy_crds(Path(unpacked["Dir"]), workspace / tool.name / "crds")
+    shutil.rmtree(workspace / "modules", ignore_errors=True)
+    for tool, entry in entries.items():
+        start, flags = time.monotonic(), ["-mod=vendor", *_flags(tool)]
+        packages = go("list", *flags, "-deps", tool.package).split()
+        # Go keeps a second copy of what a command compiles until the command ends. So each command
+        # compiles only a part. Dependencies come before their users, so this costs no time.
+        others = [one for one in packages if "." in one.partition("/")[0] and one != tool.package]
+        for first in range(0, len(others), _PACKAGES_AT_ONCE):
+            say(f"compiling {tool.name}, {first} of {len(others)} packages done")
+            go("build", *flags, *others[first : first + _PACKAGES_AT_ONCE])
+        binary = workspace / tool.name / tool.name
+        go("build", *flags, "-o", str(binary), tool.package)
         with binary.open("rb") as written:
             os.fsync(written.fileno())  # otherwise a power cut could leave an empty file
-        staging.chmod(0o755)
-        staging.rename(entry)
+        binary.parent.rename(entry)
         say(f"built in {time.monotonic() - start:.0f} s")
-    finally:
-        shutil.rmtree(staging, ignore_errors=True)
 
 
 def _copy_crds(module: Path, target: Path) -> None:
@@ -183,6 +208,32 @@ def _copy_crds(module: Path, target: Path) -> None:
         raise RigError(f"{module}: no CRDs in {' or '.join(_CRD_FOLDERS)}; have they moved?")
     for source in sources:
         (target / source.name).write_bytes(source.read_bytes())  # copies no read-only mode
+
+
+def _go(folder: Path, own: dict[str, str], *arguments: str) -> str:
+    # The linker strips debug information. Without it the compiler needs a third less disk space.
+    flags = "-mod=readonly -modcacherw -gcflags=all=-dwarf=false"
+    settings = {"GOTOOLCHAIN": "local", "GOWORK": "off", "CGO_ENABLED": "0", "GOFLAGS": flags}
+    # Settings for another system would give programs that do not run on this machine.
+    dropped = {"GOOS", "GOARCH", "GOEXPERIMENT", "GO111MODULE"}
+    kept = {key: value for key, value in os.environ.items() if key not in dropped}
+    done = subprocess.run(
+        launch.command(shutil.which("go") or "go", *arguments, niceness=19),
+        cwd=folder,
+        env=kept | settings | own,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode != 0:
+        lines = [
+            line for line in done.stderr.splitlines() if not line.startswith("go: downloading")
+        ]
+        told = "\n".join(f"  {line}" for line in lines[-_SHOWN_LINES:])
+        command = f"go {' '.join(arguments)}"
+        raise RigError(f"{folder}: `{command}` failed with {done.returncode}:\n{told}")
+    return done.stdout
 
 
 def _to_stderr(text: str) -> None:

@@ -15,8 +15,6 @@ from demandops.cluster.rollouts import OldBootstrap, Orphan, ReleaseStatus
 from demandops.model.config.inventory import Position
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.records import WaitingDemand
-from demandops.model.release import ServiceRelease
-from demandops.views.causes import remedy_of
 from demandops.views.kinds import rows_of
 from demandops.views.rows import Filter, page_of
 from demandops.views.source import Source
@@ -89,17 +87,6 @@ def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
     assert cause.why == "cannot be seen, because cluster c-its cannot be read"
 
 
-def test_a_failing_release_without_images_in_the_registry_names_its_maintainer(
-    follower: Follower,
-) -> None:
-    release = follower.newest.releases[DETECTION]
-    assert isinstance(release, ServiceRelease)
-    bare = replace(release, service=release.service.model_copy(update={"images": ()}))
-    object = "HelmRelease perception/x"
-    found = remedy_of(follower.newest, "failing", bare, object, "ImagePullBackOff")
-    assert found[0].startswith("the maintainer of appdefs/object-detection-fusion")
-
-
 def test_what_is_not_known_is_not_called_ready(
     shown: Shown, follower: Follower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -159,14 +146,6 @@ def test_overrides_that_a_filter_hides_are_not_denied(look: Look) -> None:
     assert "nothing yet" in look("/overrides").text
     page = look("/overrides", q="nothing-like-this")
     assert "nothing matches the filter" in page.text and "nothing yet" not in page.text
-
-
-def test_links_carry_the_filter_and_the_shown_commit(look: Look, state: GitRepo) -> None:
-    page = look("/services", q="vehicle00", at=state.tip)
-    assert "q=vehicle00" in page.link("Node") and "sort=node" in page.link("Node")
-    assert "q=vehicle00" in page.link("Demands")
-    earlier = look("/services", q="vehicle00", at=f"{state.tip}~1")
-    assert f"at={state.tip}~1".replace("~", "%7E") in earlier.link("Map").replace("~", "%7E")
 
 
 def test_rows_are_sorted_by_any_column_both_ways(look: Look) -> None:

@@ -1,6 +1,6 @@
 """Processes compete for a Lease over real HTTP, with a clock that the tests move.
 
-tests/e2e/flux/test_deployment.py shows that a real API server accepts the Lease.
+tests/e2e/test_deployment.py shows that a real API server accepts the Lease.
 """
 
 from __future__ import annotations

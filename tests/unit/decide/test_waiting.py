@@ -1,18 +1,60 @@
-"""What ends the waiting of a demand; ``test_capacity`` has who waits, and in which order."""
+"""What nodes have room for, and what ends the waiting of a demand; ``tests/scenarios`` has more."""
 
 from __future__ import annotations
 
 from datetime import timedelta
+from functools import cache
 from typing import Any
 
 import pytest
 import yaml
 from demandops.decide.booking import Restoration
+from demandops.decide.decision import Decision
+from demandops.decide.state import State
+from demandops.model.config.load import load
 from demandops.model.ledger import records
 from demandops.model.ledger.records import in_turn
 
+from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo
-from tests.unit.decide.test_capacity import book_waiting, recorders
+from tests.scenarios.running import configuration
+
+VEHICLES = ("vehicle00", "vehicle01")
+CAPACITY = {"west": 5, "east": 3, "vehicle00": 2}
+"""The capacity of some nodes, in cpus; other nodes have no limit."""
+
+
+@cache
+def recorders(when_full: str = "refuse") -> State:
+    """Return a state in which each driver and each replica of a recorder requests 1 cpu."""
+    nodes = [
+        {"id": id, "type": "vehicle" if id in VEHICLES else "edge", "cluster": "c-its"}
+        | ({"capacity": {"cpu": CAPACITY[id]}} if id in CAPACITY else {})
+        for id in (*VEHICLES, "west", "east")
+    ]
+    requests = {"cpu": 1}
+    domain = {"name": "all", "namespace": "all", "whenFull": when_full}
+    files = configuration(
+        ("recorder",),
+        {
+            "appdefs/recorder/appdef.yaml": {"services": {"recorder": {"requests": requests}}},
+            "appdefs/driver/service.yaml": {"requests": requests},
+            "inventory/nodes.yaml": {"nodes": nodes},
+            "inventory/brokers.yaml": {"brokers": [{"node": "west", "host": "broker"}]},
+            "policy/access-domains.yaml": {"domains": [domain]},
+        },
+    )
+    return state_of(load(files))
+
+
+def book_waiting(repo: MemoryRepo) -> list[str]:
+    """Try to book each waiting demand in order; return the ids of those that were booked."""
+    booked = []
+    for one in in_turn(repo.state.ledger.waiting):
+        taken = repo.take(one.put)
+        assert isinstance(taken, Decision)
+        booked += [one.demand] if taken.outcome == "booked" else []
+    return booked
 
 
 def waiting_repo() -> MemoryRepo:
@@ -47,6 +89,19 @@ def full_repo() -> MemoryRepo:
         taken = repo.send(put(name) | {"requesters": [who]})
         assert taken.outcome == "waiting" and taken.lease_s is None
     return repo
+
+
+def test_the_bookkeeping_has_what_is_requested_of_nodes_with_a_capacity() -> None:
+    repo = MemoryRepo(state=recorders())
+    cloud = {"point_cloud": [{"topic": "/t", "source": "vehicle01"}]}
+    app = {"id": "a", "type": "recorder", "node": "east", "inputs": cloud}
+    repo.send({"kind": "Demand", "demand": "d", "requesters": ["v"], "applications": [app]})
+    assert repo.bookkeeping()["nodes"] == {
+        "east": {"cpu": {"requested": "1", "capacity": "3"}},
+        "vehicle00": {"cpu": {"requested": "0", "capacity": "2"}},
+        "west": {"cpu": {"requested": "0", "capacity": "5"}},
+    }
+    assert "nodes" not in MemoryRepo().bookkeeping()
 
 
 def test_a_rollback_leaves_what_waits() -> None:

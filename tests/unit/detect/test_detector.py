@@ -15,6 +15,10 @@ from demandops.detect.rule_file import Goal
 from tests.kit import plain_yaml
 from tests.kit.detection import POSE, SOURCES, Run, at, demand, file_of, rule
 
+EVENTS, DEMANDS, BOOKED = (
+    plain_yaml.load(Path(__file__).with_name(f"{name}.yaml").read_text())
+    for name in ("events", "wanted_demands", "booked_demands")
+)
 NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
 LEVELS = {"start": 2, "stop": 1}
 POSITIONS = [{"node": "n", "x": "{x}"}]
@@ -31,9 +35,8 @@ RULES = [
 ]
 
 
-def entry(*requesters: str, request: str = "", joined: bool = False) -> dict[str, Any]:
-    action = "DeploymentRequest" if joined else "Demand"
-    return {"action": action, "request": request, "requesters": sorted(requesters)}
+def entry(*requesters: str) -> dict[str, Any]:
+    return {"action": "Demand", "request": "", "requesters": sorted(requesters)}
 
 
 def test_requesters_tell_the_entities_that_an_id_does_not() -> None:
@@ -47,31 +50,9 @@ def test_requesters_tell_the_entities_that_an_id_does_not() -> None:
 
 
 def test_the_booked_demands_of_rules_are_told_from_all_others() -> None:
-    books = {
-        "demands": {
-            "f00d": entry("station", "car7", request="station/perception", joined=True),
-            "f01d": entry("station", "tram", request="station/perception", joined=True),
-            "f02d": entry("car8", request="station/perception", joined=True),
-            "f03d": entry("station", "car7", request="other", joined=True),
-            "puts/bus1": entry("r"),
-            "puts/car1": entry("r"),
-            "puts/bus1/x": entry("r"),
-            "pair/a/b": entry("r"),
-            "full": entry("r"),
-            "at/car9": entry("car9"),
-            "at/car8": entry("car9"),
-        },
-        "waiting": [{"demand": "puts/bus2", "requesters": ["r"], "since": "", "priority": 0}],
-    }
-    booked = booked_events(file_of(*RULES), books)
-    assert {key: goal.id for key, goal in booked.items()} == {
-        ("joins", ("car7",)): "station/perception",
-        ("puts", ("bus1",)): "puts/bus1",
-        ("puts", ("bus2",)): "puts/bus2",
-        ("pair", ("a", "b")): "pair/a/b",
-        ("full", ()): "full",
-        ("there", ("car9",)): "at/car9",
-    }
+    booked = booked_events(file_of(*RULES), BOOKED["books"])
+    found = [[rule, *entities, goal.id] for (rule, entities), goal in booked.items()]
+    assert sorted(found) == sorted(BOOKED["events"])
     released = {"demand": "at/car9", "requesters": ["car9"], "operation": "release"}
     assert booked["there", ("car9",)].ended().data == released
     assert booked_events(file_of(*RULES), {"services": {}}) == {}
@@ -124,12 +105,6 @@ def test_an_entity_that_does_not_come_back_after_a_restart_is_gone() -> None:
     assert (event.why, want.goal) == ("bus1 has not been seen since the start", None)
 
 
-EVENTS, DEMANDS = (
-    plain_yaml.load(Path(__file__).with_name(f"{name}.yaml").read_text())
-    for name in ("events", "wanted_demands")
-)
-
-
 def seconds(time: float | datetime) -> float:
     return time.timestamp() if isinstance(time, datetime) else time
 
@@ -178,13 +153,7 @@ def test_a_step_leaves_the_state_before_as_it_was() -> None:
     assert len(first[1]) == 2
 
 
-GOALS = {
-    "put": Goal("Demand", {"demand": "d", "requesters": ["a"], "applications": [1]}),
-    "other": Goal("Demand", {"demand": "d", "requesters": ["a"], "applications": [2]}),
-    "others": Goal("Demand", {"demand": "d", "requesters": ["a", "b"], "applications": [1]}),
-    "join": Goal("DeploymentRequest", {"id": "r", "apps": []}),
-    "changed": Goal("DeploymentRequest", {"id": "r", "apps": [1]}),
-}
+GOALS = {name: Goal(action, data) for name, (action, data) in BOOKED["goals"].items()}
 
 
 def key(event: str) -> tuple[str, tuple[str, ...]]:

@@ -16,11 +16,13 @@ from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
 from demandops.connections.zenoh import ZENOH
 from demandops.decide.booking import apply
-from demandops.model.demand.demand import Demand, Item, Lease
+from demandops.model.demand.demand import UNSTARTED, Demand, Item, Lease
+from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim
 from demandops.model.ledger.ledger import Changes, Ledger
 
-from tests.kit.memory import NOW, rebuilt
+from tests.kit.goals import put
+from tests.kit.memory import NOW, MemoryRepo, rebuilt
 
 HELD = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
 
@@ -71,3 +73,21 @@ def test_links_are_known_at_both_nodes_as_long_as_somebody_holds_them(kind: Conn
     for claim, at_target in zip(ledger.connection_claims("c"), [("c",), ()], strict=True):
         ledger = ledger.replace(claim.key, None)
         assert known(ledger) == [(*at_target, "d"), at_target, ("d",)]
+
+
+def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
+    books = MemoryRepo()
+    decision = books.decide(put("d", lease=60))
+    ledger = books.decide(replace(decision.request, awaits_approval=True)).state.ledger
+    claims = ledger.claims_with("demand", "d")
+    claim = next(one for one in claims if one.is_on_application)
+    assert claim.lease is not None
+    assert claim.lease.until == UNSTARTED
+    assert not claim.lease.has_started
+    text = claim_files.text_of(claim)
+    assert "until" not in text
+    assert claim_files.read(text, claim_files.path_of(claim.key)) == claim
+    assert {one.key for one in ledger.unstarted_claims()} == {one.key for one in claims}
+    later = claim.lease.started(NOW)
+    assert (later.seconds, (later.until - NOW).total_seconds()) == (60, 60)
+    assert ledger.ended_claims(NOW.replace(year=2100)) == ()

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import combinations
-from types import MappingProxyType
 
 from demandops.base import naming
-from demandops.base.errors import Refused
 from demandops.base.naming import id_problem
-from demandops.decide.decision import Decision
-from demandops.model.config.inventory import Node
 from demandops.model.ledger.claim import demand_id
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.chance import examples, told, visible
-from tests.kit.goals import application, connection, goal
-from tests.kit.memory import MemoryRepo
+from tests.kit.chance import examples, visible
 
 DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
 ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -138,92 +130,3 @@ def test_derived_topics_are_the_references_or_differ_and_ros_takes_them(
         topic = f"/{naming.topic_part(*subject)}_global_trajectories"
         assert ROS_TOPIC.fullmatch(topic), topic
         assert len(topic) <= LONGEST_TOPIC
-
-
-@examples(30)
-@given(
-    st.lists(ids, min_size=2, max_size=4, unique=True),
-    st.lists(ids, min_size=1, max_size=4, unique=True),
-    st.lists(ids, min_size=1, max_size=4, unique=True),
-    st.lists(topics, min_size=1, max_size=3, unique=True),
-)
-def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
-    nodes: list[str], applications: list[str], connections: list[str], clouds: list[str]
-) -> None:
-    repo = with_nodes(nodes)
-    asked = [(cloud, node) for node in nodes for cloud in [usual_cloud(nodes, node), *clouds]]
-    placed = {id_: nodes[place % len(nodes)] for place, id_ in enumerate(applications)}
-    apps = [application(id_, node=node, clouds=asked) for id_, node in placed.items()]
-    ends = nodes[0], nodes[1]
-    links = [
-        connection(id_, ends=ends, topics=["/a"], targets=[f"/b{number}"])
-        for number, id_ in enumerate(connections)
-    ]
-    (request,) = told([goal(apps, links)])
-
-    taken = repo.take(request)
-
-    if isinstance(taken, Refused):
-        ids_of_topics = {*nodes, *applications}
-        assert {fault.code for fault in taken.faults} == {"conflict"}
-        assert len({*map(as_the_reference, ids_of_topics)}) < len(ids_of_topics), taken
-        return
-    places = {*placed.values()}
-    brokers = repo.config.brokers.keys()
-    derived = {
-        (place, *topic)
-        for place in places
-        for topic in asked
-        if topic[1] != place and {topic[1], place} & brokers
-    }
-    releases = len(places) * len(asked) + len(applications) + 2 * len(connections)
-    releases += 2 * len(derived)
-    assert len(taken.releases) == len({release.name for release in taken.releases}) == releases
-    manifests = [*repo.rendered().values()]
-    assert len(manifests) == releases
-    names = [name for text in manifests for name in re.findall(r"nodeName: (\S+)", text)]
-    assert len({*names}) == len(names), "a service and a watcher have one name"
-    lowered = [path.lower() for path in taken.files]
-    assert len(set(lowered)) == len(lowered), "a file system that ignores case would confuse them"
-    assert all(len(part) <= 100 for path in taken.files for part in path.split("/"))
-    for node in map(quoted, places):
-        texts = [text for text in manifests if f"demandops/node: {node}" in text]
-        produced = re.findall(r"(?:objectList|fusedObjectLists)Topic: (\S+)", "".join(texts))
-        assert len(set(produced)) == len(produced)
-        assert all(ROS_TOPIC.fullmatch(topic) for topic in produced)
-    shutdown = repo.take({**request, "shutdown": True})
-    assert isinstance(shutdown, Decision), shutdown
-    assert repo.files == with_nodes(nodes).files
-
-
-def usual_cloud(nodes: list[str], node: str) -> str:
-    return f"/usual/cloud{nodes.index(node)}"
-
-
-def with_nodes(nodes: list[str]) -> MemoryRepo:
-    """Return a new repo with further nodes that have these ids, even invalid ones."""
-    repo = MemoryRepo()
-    config = repo.state.config
-    (domain,) = config.domains.values()
-    more = {
-        id_: Node(
-            id=id_,
-            type="vehicle",
-            cluster="c-its",
-            selector={"any": "label"},
-            topics={"point_cloud": usual_cloud(nodes, id_)},
-        )
-        for id_ in nodes
-    }
-    config = replace(
-        config,
-        nodes=MappingProxyType({**config.nodes, **more}),
-        domain_of=MappingProxyType({**config.domain_of, **dict.fromkeys(more, domain)}),
-    )
-    repo.state = replace(repo.state, config=config)
-    return repo
-
-
-def quoted(text: str) -> str:
-    """Return a text in quotes, in the way in which the templates quote it."""
-    return json.dumps(text, ensure_ascii=False)

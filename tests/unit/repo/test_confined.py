@@ -22,24 +22,19 @@ from demandops.repo.merge_check.rendered_charts import (
     parsed_lint,
 )
 
+from tests.kit import plain_yaml
 from tests.kit.config import edited
 from tests.kit.http import serving
 from tests.kit.memory import MemoryRepo
 
 
 def confine(code: str, *arguments: str, seconds: int = 60) -> subprocess.CompletedProcess[str]:
-    command = [
-        sys.executable,
-        "-IS",
-        confined_process.__file__,
-        str(seconds),
-        sys.executable,
-        "-c",
-        code,
-    ]
-    return subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
+    confined = [sys.executable, "-IS", confined_process.__file__, str(seconds)]
+    command = [*confined, sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
+SAID = plain_yaml.load(Path(__file__).with_name("helm-says.yaml").read_text())
 Ran = Callable[[str], Report]
 FETCH = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout=5)"
 
@@ -115,19 +110,9 @@ def test_a_message_of_any_length_is_parsed_soon(ran: Ran) -> None:
     assert len(report.faults[0].message) < 1_000
 
 
-@pytest.mark.parametrize(
-    ("err", "file", "line"),
-    [
-        ("parse error at (camera/templates/service.yaml:7): unclosed action",
-         "camera/templates/service.yaml", 7),
-        ("execution error at (camera/charts/ros-service/templates/_names.tpl:31:4): no",
-         "camera/charts/ros-service/templates/_names.tpl", 31),
-        ("cannot load values.yaml: error converting YAML to JSON", "camera", None),
-        # a line number that a template made up
-        (f"camera/templates/x.yaml:{'9' * 5000}: made up", "camera/templates/x.yaml", None),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("err", "file", "line"), SAID["errors"])
 def test_an_error_names_template_and_line(err: str, file: str, line: int | None) -> None:
+    err = err.replace("LONG", "9" * 5000)
     fault = parsed_error(f"level=WARN msg=x\nError: {err}\n\nUse --debug flag\n", "camera")
     assert (fault.file, fault.line) == (file, line)
     assert fault.message.startswith(f"helm says '{err[:40]}")
@@ -135,25 +120,11 @@ def test_an_error_names_template_and_line(err: str, file: str, line: int | None)
 
 
 def test_the_kinds_of_objects_are_read() -> None:
-    out = (
-        "---\n# Source: camera/templates/a.yaml\napiVersion: apps/v1\nkind: Deployment\nspec:\n"
-        '  kind: inner\n---\napiVersion: "v1"\nkind: "ConfigMap"\ndata:\n'
-        "  a: |\n    kind: text\n---\n"
-        "# Source: camera/templates/empty.yaml\n"
-    )
-    assert [*parsed_kinds(out)] == [("apps", "Deployment"), ("", "ConfigMap")]
+    assert [*parsed_kinds(SAID["template"])] == [("apps", "Deployment"), ("", "ConfigMap")]
 
 
 def test_lint_gives_errors_and_warnings_and_no_advice() -> None:
-    found = parsed_lint(
-        "==> Linting camera\n"
-        "[INFO] Chart.yaml: icon is recommended\n"
-        "[WARNING] camera/templates/hpa.yaml: autoscaling/v2beta1 is gone\n"
-        "[ERROR] values.yaml: - at '/replicas': got string, want integer\n"
-        "- at '/image': missing property 'tag'\n\n"
-        "Error: 1 chart(s) linted, 1 chart(s) failed\n",
-        "camera",
-    )
+    found = parsed_lint(SAID["lint"], "camera")
     (warning,), (error,) = found.warnings, found.faults
     assert warning.file == "camera/templates/hpa.yaml"
     assert "'/replicas': got string, want integer - at '/image': missing prop" in error.message

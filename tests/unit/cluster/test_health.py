@@ -1,0 +1,255 @@
+"""The state of releases follows from the objects of Flux and Argo CD, as the API gives them."""
+
+from __future__ import annotations
+
+from operator import itemgetter
+from typing import Any
+
+import pytest
+from demandops.cluster.health import (
+    REQUESTED_AT,
+    ClusterDomain,
+    Flux,
+    Health,
+    ObjectSelector,
+    Target,
+    health_reader,
+    worst,
+)
+
+from tests.unit.cluster.cases import Case, Letters, condition, deployments, read_cases, told
+
+COMMITS = Letters()
+ARGOCD_CASES, FLUX_CASES = (read_cases(__file__, f"{name}.yaml") for name in ("argocd", "flux"))
+PLACE = ClusterDomain("c-its", "perception", "ns")
+
+
+def targets_in(place: ClusterDomain) -> dict[str, Target]:
+    return {
+        "service": Target(place, "od-edge", is_service=True),
+        "client": Target(place, "mqtt-a", is_service=False),
+        "gone": Target(place, "od-edge", is_service=True, wanted=False),
+    }
+
+
+# ---- Flux ----
+
+FLUX = health_reader(PLACE)
+OVER = ("Kustomization", "ns", "perception")
+SOURCE = ("GitRepository", "ns", "demandops")
+HELM = ("HelmRelease", "ns", "od-edge")
+
+
+def kustomization(applied: str = "", attempted: str = "", *conditions: Any) -> dict[str, Any]:
+    status = {"lastAppliedRevision": applied and f"main@sha1:{applied}"}
+    status["lastAttemptedRevision"] = attempted and f"main@sha1:{attempted}"
+    spec = {"sourceRef": {"name": "demandops"}}
+    return {"metadata": {}, "spec": spec, "status": status | {"conditions": list(conditions)}}
+
+
+def release(*conditions: Any, observed: int = 2) -> dict[str, Any]:
+    status = {"observedGeneration": observed, "conditions": list(conditions)}
+    return {"metadata": {"generation": 2}, "status": status}
+
+
+@pytest.mark.parametrize("case", FLUX_CASES["domain"], ids=itemgetter("when"))
+def test_an_access_domain_is_as_far_as_its_kustomization(case: Case) -> None:
+    objects: dict[tuple[str, str, str], Any] = {}
+    if "over" in case:
+        over = case["over"]
+        conditions = [condition(*one) for one in over.get("conditions", ())]
+        objects[OVER] = kustomization(over["applied"], over["attempted"], *conditions)
+    if "source" in case:
+        conditions = [condition(*one) for one in case["source"]]
+        objects[SOURCE] = {"metadata": {}, "status": {"conditions": conditions}}
+    health = FLUX.domain_health(PLACE, "b", objects, COMMITS)
+    assert told(health, case) == case
+
+
+@pytest.mark.parametrize("case", FLUX_CASES["release"], ids=itemgetter("when"))
+def test_a_release_is_healthy_when_helm_and_all_its_deployments_are(case: Case) -> None:
+    objects = deployments(case)
+    if "helm" in case:
+        conditions = [condition(*one) for one in case["helm"].get("conditions", ())]
+        objects[HELM] = release(*conditions, observed=case["helm"].get("observed", 2))
+    health = FLUX.release_health(
+        targets_in(PLACE)[case.get("of", "service")], "b", objects, COMMITS
+    )
+    assert told(health, case) == case
+
+
+def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
+    slow, failed = Health("reconciled", "slow"), Health("reconciled", "failed", failing=True)
+    assert worst([Health("healthy"), slow, failed]) == failed
+    assert worst([Health("healthy"), slow, Health("waiting")]) == Health("waiting")
+    assert worst([]).state == "healthy"
+
+
+def test_since_when_is_the_cluster_s_to_say() -> None:
+    found = {HELM: release(condition("Ready", "True"))}
+    service, client, _ = targets_in(PLACE).values()
+    assert FLUX.last_transition(service, found) == "2026-05-04T12:00:00Z"
+    assert FLUX.last_transition(client, found) == ""
+
+
+def test_levels_are_in_order() -> None:
+    levels: tuple[Any, ...] = ("pushed", "reconciled", "healthy")
+    states: tuple[Any, ...] = ("waiting", "reconciled", "healthy")
+    for reached, state in enumerate(states, start=1):
+        found = [level for level in levels if Health(state).reaches(level)]
+        assert found == [*levels[:reached]]
+
+
+@pytest.mark.parametrize("case", FLUX_CASES["idle"], ids=itemgetter("when"))
+def test_a_domain_is_idle_once_the_last_fetch_is_applied(case: Case) -> None:
+    objects: dict[tuple[str, str, str], Any] = {}
+    if "fetches" in case:
+        fetched, asked, handled = case["fetches"]
+        artifact = {"revision": f"main@sha1:{fetched}"}
+        objects[SOURCE] = {
+            "metadata": {"annotations": {REQUESTED_AT: asked}},
+            "spec": {"suspend": case.get("suspend", False)},
+            "status": {"artifact": artifact, "lastHandledReconcileAt": handled},
+        }
+        applied, attempted, ready = case["applies"]
+        objects[OVER] = kustomization(applied, attempted, condition("Ready", ready))
+    assert Flux().is_idle(PLACE, objects, before="1") is case["idle"]
+
+
+def test_a_domain_that_was_never_asked_to_fetch_is_idle() -> None:
+    never = {"metadata": {}, "status": {"artifact": {"revision": "main@sha1:a"}}}
+    objects = {SOURCE: never, OVER: kustomization("a", "a", condition("Ready", "True", "applied"))}
+    assert Flux().is_idle(PLACE, objects, before=None)
+    assert Flux().handled_request(PLACE, objects) == ""
+
+
+# ---- Argo CD ----
+
+URL = "https://git.example/fleet.git"
+IN_ARGOCD = ClusterDomain(
+    "c-its", "perception", "ns", ObjectSelector("Application", "argocd", "demandops-perception")
+)
+ARGOCD = health_reader(IN_ARGOCD)
+FOLDER = {"repoURL": URL, "path": "clusters/c-its/perception", "targetRevision": "main"}
+CHART = "appdefs/od/charts/od"
+APPLICATION = ("Application", "argocd", "demandops-perception")
+CHILD = ("Application", "ns", "od-edge")
+AT = "2026-05-04T12:00:00Z"
+
+
+def source(**values: Any) -> dict[str, Any]:
+    helm = {"releaseName": "od-edge", "valuesObject": values}
+    return {"repoURL": URL, "path": CHART, "targetRevision": "main", "helm": helm}
+
+
+def nested(depth: int) -> list[Any]:
+    return [nested(depth - 1)] if depth else []
+
+
+SOURCES: dict[str, dict[str, Any]] = {
+    "folder": FOLDER,
+    "elsewhere": {**FOLDER, "path": "clusters/x"},
+    "new": source(inputs=2),
+    "old": source(inputs=1),
+    "sparse": {**source(inputs=[], image=None, port=1), "directory": {"recurse": True}},
+    "written out": {**source(port=1), "directory": {"recurse": True, "jsonnet": {}}},
+    "deep": source(image=nested(900)),
+    "registry": {"repoURL": "oci://r.example/od", "path": ".", "targetRevision": "1.2.0"},
+}
+
+
+def application(
+    wanted: dict[str, Any],
+    *,
+    sync: str = "",
+    at: str = "",
+    compared: dict[str, Any] | None = None,
+    operation: dict[str, Any] | None = None,
+    conditions: tuple[dict[str, str], ...] = (),
+    health: str = "Healthy",
+    resources: tuple[dict[str, str], ...] = (),
+) -> dict[str, Any]:
+    """Return an Application with the source ``wanted``, which was compared if ``sync`` is set."""
+    status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
+    status["health"] = {"status": health, "lastTransitionTime": AT}
+    if sync:
+        against = {"source": wanted if compared is None else compared}
+        status["sync"] = {"status": sync, "revision": at, "comparedTo": against}
+    if operation:
+        status["operationState"] = operation
+    return {"metadata": {"name": "x"}, "spec": {"source": wanted}, "status": status}
+
+
+def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
+    """Return the ``operationState`` of a sync from the source ``of``, by default the folder."""
+    result = {"revision": revision, "source": more.pop("of", FOLDER)}
+    result["resources"] = more.pop("resources", [])
+    asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}
+    return {
+        "phase": phase, "message": message, "syncResult": result, "operation": asked, **more
+    }  # fmt: skip
+
+
+def described(default: str, fields: dict[str, Any]) -> dict[str, Any]:
+    """Return the Application that a case describes."""
+    fields, wanted = {**fields}, SOURCES[fields.get("source", default)]
+    fields.pop("source", None)
+    is_deleted = fields.pop("deleted", False)
+    if "compared" in fields:
+        fields["compared"] = SOURCES[fields["compared"]]
+    if "operation" in fields:
+        operation = {**fields["operation"]}
+        operation["of"] = SOURCES[operation.get("of", default)]
+        fields["operation"] = synced(**operation)
+    fields["conditions"] = [
+        condition(kind, "", text) for kind, text in fields.get("conditions", ())
+    ]
+    fields["resources"] = [
+        {"group": "apps", "kind": "Deployment", "namespace": "ns", "name": name}
+        for name in fields.get("resources", ())
+    ]
+    made = application(wanted, **fields)
+    made["metadata"] |= {"deletionTimestamp": AT} if is_deleted else {}
+    return made
+
+
+@pytest.mark.parametrize("case", ARGOCD_CASES["domain"], ids=itemgetter("when"))
+def test_an_access_domain_is_as_far_as_the_application_over_its_folder(case: Case) -> None:
+    objects = {APPLICATION: described("folder", case["over"])} if "over" in case else {}
+    health = ARGOCD.domain_health(IN_ARGOCD, "b", objects, COMMITS)
+    assert told(health, case) == case
+    assert health.object in ("", "Application argocd/demandops-perception")
+
+
+@pytest.mark.parametrize("case", ARGOCD_CASES["release"], ids=itemgetter("when"))
+def test_a_release_is_healthy_when_it_is_synced_as_it_stands_now_and_all_is_there(
+    case: Case,
+) -> None:
+    objects = {APPLICATION: application(FOLDER, sync="Synced", at="b"), **deployments(case)}
+    if "child" in case:
+        objects[CHILD] = described("new", case["child"])
+    history = Letters([case["changing"]] if "changing" in case else [])
+    health = ARGOCD.release_health(
+        targets_in(IN_ARGOCD)[case.get("of", "service")], "b", objects, history
+    )
+    assert told(health, case) == case
+
+
+def test_applied_commit_and_last_transition_come_from_the_applications_in_the_cluster() -> None:
+    objects = {
+        APPLICATION: application(FOLDER, sync="Synced", at="b"),
+        CHILD: application(source()),
+    }
+    assert ARGOCD.applied_commit(IN_ARGOCD, objects) == "b"
+    assert ARGOCD.applied_commit(IN_ARGOCD, {}) == ""
+    succeeded = synced("Succeeded", "b")
+    under_way = application(FOLDER, sync="OutOfSync", at="c", operation=succeeded)
+    assert ARGOCD.applied_commit(IN_ARGOCD, {APPLICATION: under_way}) == "b"
+    service, client, _ = targets_in(IN_ARGOCD).values()
+    assert ARGOCD.last_transition(service, objects) == AT
+    assert ARGOCD.last_transition(client, objects) == ""
+
+
+def test_only_one_object_of_argo_cds_namespace_is_read() -> None:
+    """The generator may lack the right to read other objects in Argo CD's namespace."""
+    assert ARGOCD.objects_to_watch(IN_ARGOCD)[0] == ObjectSelector(*APPLICATION)
