@@ -360,21 +360,14 @@ plant("turn_down_what_waits", 1, ProposalBranches, "put", lambda *_: "")
 # ---- answers, withdrawals and stops ----
 
 
-@wrong(0, journal.Journal, "mark_done")
-def note_outcomes_only_in_memory(
-    mark_done: Any, made: Any, operations: Any, *, durably: bool = False
-) -> None:
-    mark_done(made, operations)
-
-
-@wrong(0, Demands, "fail")
+@wrong(128, Demands, "fail")
 def forget_what_a_stop_leaves(
     fail: Any, made: Any, batch: Any, error: Any, keep: bool = False
 ) -> None:
     fail(made, batch, error)
 
 
-plant("say_that_all_is_withdrawn", 0, Demands, "withdraw", lambda *_: True)
+plant("say_that_all_is_withdrawn", 129, Demands, "withdraw", lambda *_: True)
 
 
 # ---- restart ----

@@ -80,7 +80,7 @@ def test_an_io_error_ends_the_process_and_the_next_start_goes_by_the_journal(bar
     ticket = generator.submit(goal(1), "op-1", fail)
     with pytest.raises(Unsound, match=r"Input/output error; check its disk"):
         rig.receipt(ticket)
-    assert generator.crig.lose(timeout=5) is False
+    assert generator.close(timeout=5) is False
     assert rig.operations(bare) == []
     assert rig.restart(bare) is True
     assert rig.operations(bare) == ["op-1"]
