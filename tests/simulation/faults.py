@@ -360,14 +360,14 @@ plant("turn_down_what_waits", 1, ProposalBranches, "put", lambda *_: "")
 # ---- answers, withdrawals and stops ----
 
 
-@wrong(128, Demands, "fail")
+@wrong(0, Demands, "fail")
 def forget_what_a_stop_leaves(
     fail: Any, made: Any, batch: Any, error: Any, keep: bool = False
 ) -> None:
     fail(made, batch, error)
 
 
-plant("say_that_all_is_withdrawn", 129, Demands, "withdraw", lambda *_: True)
+plant("say_that_all_is_withdrawn", 1, Demands, "withdraw", lambda *_: True)
 
 
 # ---- restart ----

@@ -25,8 +25,6 @@ from tests.simulation.promises import Maker, name_of
 from tests.simulation.world import World
 
 STEPS = 30
-FIRST_WITH_STOPS = 128
-"""The first seed whose history has withdrawals and stops; planted faults name seeds before it."""
 STATE_REPO = Path(__file__).with_name("state-repo")
 MEMORY = "/dev/shm"
 NODES = "inventory/nodes/places.yaml"
@@ -76,9 +74,8 @@ class History:
         things = (
             [self.demand] * 15 + [self.rush] * 2 + [self.wait] * 4 + [self.edit] * 3
             + [self.decide] * 2 + [self.crash] * 2 + [self.spoil_network] * 3 + [self.set_clocks]
+            + [self.withdraw] * 2 + [self.stop]
         )  # fmt: skip
-        if self.world.seed >= FIRST_WITH_STOPS:
-            things += [self.withdraw] * 2 + [self.stop]
         self.turns.sleep(1)
         for _ in range(steps):
             self.chance.choice(things)()

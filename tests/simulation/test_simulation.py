@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 
 from tests.simulation.faults import FAULTS
-from tests.simulation.history import FIRST_WITH_STOPS, clean_up, play
+from tests.simulation.history import clean_up, play
 
 ROOT = Path(__file__).parents[2]
-SEEDS = range(FIRST_WITH_STOPS - 60, FIRST_WITH_STOPS + 60)
+SEEDS = range(120)
 
 
 @pytest.fixture(scope="module", autouse=True)

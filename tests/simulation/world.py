@@ -271,8 +271,7 @@ def _pushed(command: tuple[str, ...], what: str, code: int = 1) -> GitResult:
 
 class World:
     def __init__(self, seed: int, template: Path, folder: Path, machines: int) -> None:
-        self.seed, self.folder, self.numbers = seed, folder, count(1)
-        self.turns = Turns(seed)
+        self.turns, self.folder, self.numbers = Turns(seed), folder, count(1)
         self.remote = pygit2.Repository(str(shutil.copytree(template, folder / "remote.git")))
         self.pushed_by: dict[str, tuple[Machine, float, float]] = {}
         """For each pushed tip of main: the machine, when its generator started, when it pushed."""
