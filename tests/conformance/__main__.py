@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--domain", type=int, default=int(os.environ.get("ROS_DOMAIN_ID", "0")))
     add("--reference", action="store_true", help="it is the reference; its differences are known")
     add("--all", action="store_true", help="play all 576 orders of joining and leaving")
-    add("--seed", type=int, default=0, help="choose which orders to play")
+    add("--seed", type=int, default=0, help="choose what is played at random")
     given = parser.parse_args(arguments)
     names = (given.server, given.demand_server, given.bookkeeping)
     with closing(Servers(given.domain, *names)) if given.server else own_node() as servers:
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("only answers are compared; --bookkeeping says who requests what")
         failed = 0
         played = orders(given.seed, every=given.all)
-        for verdict in verdicts(servers, played, is_reference=given.reference):
+        for verdict in verdicts(servers, played, given.seed, is_reference=given.reference):
             print(verdict, flush=True)
             failed += verdict.word == "fails"
     return 1 if failed else 0

@@ -86,6 +86,7 @@ class Servers:
         if self.are_asked:
             self._books = self.client.node.create_client(GetBookkeeping, bookkeeping)
             self.client.wait(self._books.service_is_ready)
+            self.client.ask(lambda: self._books.call_async(GetBookkeeping.Request()))
 
     def close(self) -> None:
         self.client.close()
@@ -198,6 +199,38 @@ class Rule:
         return self._servers.deploy(goals.goal([], [item | more], id=id, shutdown=is_shutdown))
 
 
+def random_steps(seed: int, count: int = 40) -> Iterator[dict[str, Any]]:
+    """Yield joins and shutdowns by a few parties, with what ten lines of bookkeeping say of each.
+
+    A party is a request id with its requesters. It holds what it joined and has not shut down, and
+    no party takes from another. In the end each shuts down all, and nothing is left.
+    """
+    chance = random.Random(seed)
+    held: dict[tuple[str, str], set[str]] = {
+        party: set() for party in product(("vehicle00", "vehicle01", "station00 vehicle00"), "rs")
+    }
+    goals_of = [
+        (party, chance.sample("abc", chance.randint(1, 3)), chance.random() < 0.5)
+        for party in chance.choices([*held], k=count)
+    ]
+    for party, topics, joins in [*goals_of, *((party, [], False) for party in held)]:
+        before = held[party]
+        held[party] = before | {*topics} if joins else before - {*(topics or before)}
+        changed = held[party] != before
+        outcome = ("booked" if changed else "unchanged") if joins else "released"
+        requesters = {
+            topic: {each for (who, _), own in held.items() if topic in own for each in who.split()}
+            for topic in set[str]().union(*held.values())
+        }
+        yield {
+            "join" if joins else "shutdown": " ".join(topics),
+            "who": party[0],
+            "id": party[1],
+            "is": outcome if joins or changed else "not-held",
+            "held": {topic: " ".join(who) for topic, who in requesters.items()},
+        }
+
+
 # ---- the wire ----
 
 
@@ -285,7 +318,9 @@ def orders(seed: int, *, every: bool) -> list[tuple[int, ...]]:
 # ---- all rules ----
 
 
-def all_rules(servers: Servers, played: list[tuple[int, ...]]) -> Iterator[tuple[str, str, Any]]:
+def all_rules(
+    servers: Servers, played: list[tuple[int, ...]], seed: int
+) -> Iterator[tuple[str, str, Any]]:
     """Yield each rule's name, how the reference differs, and a function that tries the rule."""
     yield "the feedback has the type of the action", "", partial(feedback_has_the_type, servers)
     again = partial(a_result_can_be_asked_for_again, servers)
@@ -302,15 +337,18 @@ def all_rules(servers: Servers, played: list[tuple[int, ...]]) -> Iterator[tuple
         for number, entry in enumerate(rules):
             rule = Rule(f"{action}{number}", entry["steps"], servers)
             yield f"{action}: {entry['rule']}", entry.get("reference", ""), rule.try_it
+    steps = [*random_steps(seed)]
+    counted = f"{len(steps)} random joins and shutdowns are counted, and nothing is left"
+    yield counted, "all rows of counting", Rule("random", steps, servers).try_it
     plain_text = "its feedback and its results are plain text"
     stages = "each stage is told, in order, and of what is refused at most the first"
     yield stages, plain_text, partial(stages_are_told, servers)
 
 
 def verdicts(
-    servers: Servers, played: list[tuple[int, ...]], *, is_reference: bool = False
+    servers: Servers, played: list[tuple[int, ...]], seed: int, *, is_reference: bool = False
 ) -> Iterator[Verdict]:
-    for name, difference, try_it in all_rules(servers, played):
+    for name, difference, try_it in all_rules(servers, played, seed):
         try:
             try_it()
         except Unlike as unlike:

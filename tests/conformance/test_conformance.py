@@ -67,7 +67,7 @@ def test_our_node_keeps_all_rules(capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr().out
     found = names_by_word(printed)
     assert (code, found["fails"], found["differs"]) == (0, set(), set()), printed
-    assert len(found["holds"]) == sum(map(len, RULES.values())) + 6
+    assert len(found["holds"]) == sum(map(len, RULES.values())) + 7
 
 
 def test_a_server_that_says_yes_to_everything_fails(capsys: pytest.CaptureFixture[str]) -> None:
@@ -95,9 +95,12 @@ def test_a_reference_may_differ_in_what_the_page_explains_and_in_nothing_else(
         for entry in RULES["DeploymentRequest"]
         if any(step["is"] not in OUTCOMES for step in entry["steps"])
     }
-    assert names_by_word(printed)["differs"] == refusing | {
-        "each stage is told, in order, and of what is refused at most the first"
-    }
+    others = names_by_word(printed)["differs"] - refusing
+    assert sorted(name.split(",")[0] for name in others) == [
+        "46 random joins and shutdowns are counted",
+        "each stage is told",
+    ]
+    assert refusing <= names_by_word(printed)["differs"]
 
 
 def test_each_difference_is_a_row_of_the_page() -> None:

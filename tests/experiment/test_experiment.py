@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -272,3 +273,9 @@ def test_the_larger_experiment_s_rules_events_and_checks() -> None:
 def test_a_path_below_a_mount_becomes_one_of_this_machine(text: str, found: str) -> None:
     mounts = {"/config": "/pod/c", "/config/deep": "/pod/d", "/tmp": "/tmp/pod/t"}
     assert path_in_pod(text, mounts | {"/params": "/tmp/pod/i"}) == found
+
+
+def test_one_module_of_the_examples_imports_the_tests() -> None:
+    files = Path(paper.__file__).parents[1].rglob("*.py")
+    importing = re.compile(r"^\s*(?:from|import) tests\b", re.MULTILINE)
+    assert [file.name for file in files if importing.search(file.read_text())] == ["rig.py"]

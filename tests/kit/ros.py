@@ -213,6 +213,10 @@ class Client:
 
     def ready(self) -> None:
         self.wait(self.reaches_a_node)
+        self.ask(lambda: ask_the_node(self._client))
+
+    def ask(self, call: Callable[[], Any]) -> None:
+        """Call a service once a second until it answers; it may not know this client at first."""
         asked: list[Any] = []
         ask_at = 0.0
 
@@ -220,7 +224,7 @@ class Client:
             nonlocal ask_at
             if time.monotonic() > ask_at:
                 ask_at = time.monotonic() + 1
-                asked.append(ask_the_node(self._client))
+                asked.append(call())
             return any(one.done() for one in asked)
 
         self.wait(is_answered)

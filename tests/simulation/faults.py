@@ -14,7 +14,7 @@ from typing import Any
 
 from demandops.base.errors import InvalidInput
 from demandops.connections import connection
-from demandops.connections.connection import ConnectionType, Route
+from demandops.connections.connection import Connection, ConnectionType, Route
 from demandops.decide import booking, decision, edits
 from demandops.decide.admission import completing, permission
 from demandops.decide.checks import forbidden
@@ -25,9 +25,9 @@ from demandops.decide.placement.candidates import Choice
 from demandops.decide.planning import overrides, planner
 from demandops.decide.state import Changeset
 from demandops.model.config.config import Config
-from demandops.model.demand.demand import Lease
-from demandops.model.ledger import ledger
+from demandops.model.demand.demand import Application, Lease
 from demandops.model.ledger.claim import Claim, path_of, text_of
+from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import WaitingDemand
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.load import snapshot
@@ -101,9 +101,17 @@ def in_reverse(right: Wrong, *given: Any) -> Any:
 
 plant("let_strangers_change_a_demand", 1, permission, "stranger_faults", lambda *_: ())
 plant("release_only_the_first_claim", 34, booking, "claims_of", first_only)
-plant("replace_what_was_joined", 2, Claim, "extending", itself)
-plant("commit_what_is_booked_already", 6, Claim, "after_booking", itself)
+plant("replace_what_was_joined", 2, Application, "extended", lambda _, app, more: more)
+plant("replace_what_was_joined", 2, Connection, "extended", lambda _, connection, more: more)
 plant("grant_one_claim_too_many", 4, forbidden, "_held", lambda held, *given: held(*given) - 1)
+
+
+@wrong(6, booking, "book")
+def commit_what_is_booked_already(
+    book: Any, ledger: Any, item: Any, request: Any, key: Any, current: Any, now: Any, **more: Any
+) -> Any:
+    made = book(ledger, item, request, key, current, now, **more)
+    return made.replace(key, replace(made.get(key), booked=now))
 
 
 @wrong(6, booking, "shut_down")
@@ -255,7 +263,10 @@ def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any
     return Changeset({**(more or {})}, ())
 
 
-plant("let_the_lowest_priority_win", 16, ledger, "by_rank", in_reverse)
+@wrong(16, World, "__post_init__")
+def let_the_lowest_priority_win(right: Any, world: Any) -> None:
+    right(world)
+    object.__setattr__(world, "overrides", world.overrides[::-1])
 
 
 @wrong(16, overrides, "fits")

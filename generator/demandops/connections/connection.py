@@ -268,7 +268,7 @@ class Connection:
 # ---- the interface of a connection type, and of the clients that it plans ----
 #
 # Each type has a module with a subclass of :class:`ConnectionType`, which plans clients as data.
-# :mod:`.manifests` makes a client's file from that data and from ``templates/connections/<type>/``.
+# :mod:`.gitops` makes a client's file from that data and from ``templates/connections/<type>/``.
 # In that folder, ``client.yaml.j2`` is the template of a Deployment with the client's name, and
 # ``schema.json`` lists the fields that the client's program reads.
 
@@ -323,7 +323,7 @@ class Client(ABC):
         return strict_yaml.dump(configuration)
 
     def settings(self, config: Config) -> ClientSettings:
-        settings = config.clients.of(self.type.word)
+        settings: ClientSettings = getattr(config.clients, self.type.word, ClientSettings())
         for file, patch in self.shaping.patches:
             settings = patched_settings(settings, patch, file)
         return settings

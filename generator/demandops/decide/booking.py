@@ -138,8 +138,11 @@ def book(
     lease = item.lease
     if lease and not request.awaits_approval:
         lease = lease.started(now, current.lease if current else None)
+    held = item.held.booked()
+    if joined and current:  # with everything added that the claim so far holds
+        held = current.held.extended(held).booked()  # type: ignore[arg-type]
     claim = Claim(
-        held=item.held.booked(),
+        held=held,
         demand=key.demand,
         request=request.id,
         requesters=tuple(sorted(set(item.requesters))),
@@ -147,9 +150,11 @@ def book(
         lease=lease,
         joined=joined,
     )
-    if joined and current:
-        claim = claim.extending(current)
-    return ledger.replace(key, claim.after_booking(current))
+    # The time of booking stays if at most the lease changes. Else each renewal, and each demand
+    # that is sent again, would change the claim's file.
+    if current and replace(claim, booked=current.booked, lease=current.lease) == current:
+        claim = replace(claim, booked=current.booked)
+    return ledger.replace(key, claim)
 
 
 def join(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:

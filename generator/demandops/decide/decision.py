@@ -154,15 +154,13 @@ def decide(
         checkpoint = _NO_LIMIT
     tell = cache(on_stage)  # once for each stage, because there may be several attempts
 
-    def throttled(request: Demand) -> Demand:
-        if too_soon := tuple(throttle(request, config)):
-            raise _TooSoon(too_soon)
-        return request
-
     def attempt(request: Demand, faults: Sequence[Fault] = ()) -> _Booked:
+        counts = demand if isinstance(request, Wait) else None
         if not request.is_complete:
-            # in this order, because a demand with faults does not count against the limits
-            request = throttled(admitted(request, state, faults, checkpoint))
+            counts = request = admitted(request, state, faults, checkpoint)
+        # in this order, because a demand with faults does not count against the limits
+        if counts and (too_soon := tuple(throttle(counts, config))):
+            raise _TooSoon(too_soon)
         tell("admitted")
         return _booked(state, request, now, read, checkpoint)
 
@@ -173,7 +171,6 @@ def decide(
             wait = _wait(state, demand, refused.faults, now, checkpoint)
             if wait is None:
                 raise
-            throttled(demand)
             booked = attempt(wait)
         request, changes, after = booked.request, booked.changes, booked.after
         rendered = render_change(

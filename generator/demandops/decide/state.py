@@ -30,6 +30,7 @@ from demandops.decide.planning.planner import (
 )
 from demandops.model.config.appdef import ApplicationDefinition
 from demandops.model.config.config import Config
+from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.demand.demand import Application, Demand, InputTopic, Item
 from demandops.model.ledger import claim as claim_files
@@ -447,6 +448,31 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
     return list(dict.fromkeys(faults))
 
 
+def described(
+    before: Release | None, after: Release | None, text: str | None, new_text: str | None
+) -> ReleaseChange:
+    """Return how a release changes, by its plans and its texts before and after."""
+    change = describe_change(before, after, text is not None)
+    if change.change != "change":
+        return change
+    paths = [path_of(side) for side in (before, after) if side]
+    if len({*paths}) > 1:
+        moved = (f"- {paths[0]}", f"+ {paths[1]}")
+        return replace(change, details=(*moved, *change.details))
+    # what overrides change is told by the fields too, such as the tag of an image
+    facts = list[str]()
+    if all(detail[2:].startswith(f"{OVERRIDES_ROOT}/") for detail in change.details):
+        with suppress(InvalidInput):
+            was, now = list(load_all(text or "")), list(load_all(new_text or ""))
+            differing = list(leaf_differences(was, now))
+            for path, *sides in differing[:_MOST_FACTS]:
+                shown = ("none" if side is ABSENT else short_repr(side) for side in sides)
+                facts.append(f"{path.removeprefix('[0].')}: {' → '.join(shown)}")
+            if len(differing) > _MOST_FACTS:
+                facts.append(f"and {len(differing) - _MOST_FACTS} more")
+    return replace(change, details=(*change.details, *facts))
+
+
 def preview(
     old: Mapping[ReleaseKey, Release],
     new: Mapping[ReleaseKey, Release],
@@ -475,21 +501,7 @@ def preview(
             continue
         of_releases |= {old_path, new_path}
         text = current.get(old_path or new_path)
-        change = describe_change(before, after, text is not None)
-        if change.change == "change" and old_path and old_path != new_path:
-            moved = (f"- {old_path}", f"+ {new_path}")
-            change = replace(change, details=(*moved, *change.details))
-        elif change.change == "change" and not change.details:
-            with suppress(InvalidInput):
-                was, now = list(load_all(text or "")), list(load_all(files.get(new_path, "")))
-                differing = list(leaf_differences(was, now))
-                facts = []
-                for path, *sides in differing[:_MOST_FACTS]:
-                    shown = ("none" if side is ABSENT else short_repr(side) for side in sides)
-                    facts.append(f"{path.removeprefix('[0].')}: {' → '.join(shown)}")
-                if len(differing) > _MOST_FACTS:
-                    facts.append(f"and {len(differing) - _MOST_FACTS} more")
-                change = replace(change, details=tuple(facts))
+        change = described(before, after, text, files.get(new_path))
         releases.append(change)
     releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
     others = tuple(sorted(changed - of_releases))

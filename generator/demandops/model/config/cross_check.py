@@ -97,7 +97,7 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
             )
             reader.add_fault(file, f"{place}.hostNetwork", message)
     for word, file in config.entry_files[configs.CLIENTS_FILE].items():
-        if closed and config.clients.of(word).host_network:
+        if closed and getattr(config.clients, word).host_network:
             message = (
                 f"is true, and podSecurity of access domain '{closed}' is baseline, which "
                 "forbids it; leave it out, so that each client has the setting of its node"

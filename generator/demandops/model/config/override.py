@@ -7,7 +7,7 @@ between two of them, and ``decide.planning.overrides`` applies overrides to rele
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Annotated, Any, Literal, TypeVar
@@ -266,8 +266,3 @@ def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) ->
         return settings.model_validate({k: v for k, v in data.items() if k not in of_mqtt - own})
     except ValidationError as error:
         raise InvalidInput(base_model.faults_of(error, type(settings), file, ("values",))) from None
-
-
-def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
-    # the order in which they apply; the last one wins
-    return tuple(sorted(overrides, key=lambda override: (override.priority, override.name)))

@@ -267,9 +267,5 @@ class ClientsFile(FileModel):
     zenoh: ClientSettings = ClientSettings()
     ros: ClientSettings = ClientSettings()
 
-    def of(self, connection_type: str) -> ClientSettings:
-        settings: ClientSettings = getattr(self, connection_type, ClientSettings())
-        return settings
-
 
 DEFAULT_SETTINGS = ClientsFile(apiVersion="demandops/v1", kind="Clients")

@@ -86,10 +86,6 @@ class Claim:
             yield ("ends", minute_of(self.lease.expires_at))
         yield from self.held.index_entries()
 
-    def extending(self, current: Claim) -> Claim:
-        # with everything added that the claim so far holds
-        return replace(self, held=current.held.extended(self.held).booked())  # type: ignore[arg-type]
-
     def without_topics(self, gone: Container[TopicKey]) -> Claim | None:
         held = self.held.without_topics(gone)
         return replace(self, held=held) if held else None
@@ -97,14 +93,6 @@ class Claim:
     def without_node(self, node: str) -> Claim | None:  # the claim must need the node
         held = self.held.without_node(node)
         return replace(self, held=held) if held else None
-
-    def after_booking(self, current: Claim | None) -> Claim:
-        if current is None:
-            return self
-        # The time of booking stays if at most the lease changes. Else each renewal, and each demand
-        # that is sent again, would change the claim's file.
-        kept = replace(self, booked=current.booked)
-        return kept if replace(kept, lease=current.lease) == current else self
 
 
 def minute_of(moment: datetime) -> str:

@@ -15,7 +15,7 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import connection_types
 from demandops.connections.connection import Connection
 from demandops.model.config.config import Config
-from demandops.model.config.override import Override, by_rank, format_time
+from demandops.model.config.override import Override, format_time
 from demandops.model.demand.demand import UNSTARTED, Application, InputTopic
 from demandops.model.ledger.claim import Claim, ClaimKey, minute_of
 from demandops.model.ledger.records import WaitingDemands
@@ -307,4 +307,6 @@ class World:
             # a person who extends an ended override gives it a new end, and so it is active again
             if override.end is None or self.ledger.ended.get(name) != format_time(override.end)
         ]
-        object.__setattr__(self, "overrides", by_rank(active))
+        # the last one wins
+        by_rank = sorted(active, key=lambda override: (override.priority, override.name))
+        object.__setattr__(self, "overrides", tuple(by_rank))
