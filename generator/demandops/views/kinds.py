@@ -115,9 +115,9 @@ def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
     for row in rows_of(source, name):
         since = row.item.get("since") if kind.trailer else None
         began[row.item["name"]] = parse_time(since) if since else None
-    stopped = (
-        commit_log.stopped_releases(reader.objects, source.commit) if name == "releases" else {}
-    )
+    stopped = dict[str, list[str]]()
+    if name == "releases":
+        stopped = commit_log.stopped_releases(reader.objects, source.commit)
     for number, entry in enumerate(reader.log(source.commit)):
         if number == MOST_COMMITS:
             return [*map(kind.row, past.values())], entry.commit
@@ -338,7 +338,8 @@ def claim_item(source: Source, claim: Claim, state: str) -> Json:
     way = f"send request '{claim.request}' again with shutdown: true"
     if claim.keeping_override is not None:
         way = f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
-    elif is_released_by_demand_id(claim):
+    # a goal of the reference's action has no demand id: the generator derives it from the request
+    elif claim.demand != demand_id(claim.request, claim.requesters):
         way = f"send 'operation: release' for demand '{claim.demand}'"
     return {
         "name": data["file"],
@@ -348,12 +349,6 @@ def claim_item(source: Source, claim: Claim, state: str) -> Json:
         "kept_by": vocabulary.override_data(kept, ("keep",)) if kept else None,
         "suspended_by": vocabulary.override_data(denying, ("deny",)) if denying else None,
     }
-
-
-def is_released_by_demand_id(claim: Claim) -> bool:
-    # A goal of the reference's action has no demand id. The generator derives it from the request.
-    is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
-    return claim.keeping_override is None and not is_of_a_request
 
 
 def _suspending(item: Json, now: datetime) -> list[str]:
