@@ -391,6 +391,7 @@ class Demands:
             ticket = self._journal.pending.get(operation)
             if ticket is None or "withdrawn" not in _NEXT[ticket.state]:
                 return ticket is not None and ticket.state == "withdrawn"
+            awaits_approval = ticket.proposal is not None
             try:
                 self._withdraw(ticket, TAKEN_BACK)
             # if unsound, the worker ends the process
@@ -398,7 +399,8 @@ class Demands:
                 log.error("demand %s cannot be withdrawn: %s", operation, error)
                 self.wake()
                 return False
-        self._answer_withdrawn(ticket)
+        if not awaits_approval:  # else it is answered after its branch is deleted
+            self.answer([(ticket, errors.Withdrawn(TAKEN_BACK))])
         return True
 
     def _give_up_what_is_dropped(self) -> None:
@@ -415,8 +417,10 @@ class Demands:
                 if ticket.state == "committed":
                     ticket.state, ticket.withdrawn = "withdrawn", GIVEN_UP
                     continue
+                awaits_approval = ticket.proposal is not None
                 self._withdraw(ticket, GIVEN_UP)
-            self._answer_withdrawn(ticket)
+            if not awaits_approval:
+                self.answer([(ticket, errors.Withdrawn(GIVEN_UP))])
 
     def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
         with self._changed:
@@ -434,11 +438,6 @@ class Demands:
             self.wake()
         ticket.withdrawn = reason
         _change(ticket, "withdrawn")
-
-    def _answer_withdrawn(self, ticket: Ticket) -> None:
-        # one that awaits approval is answered after its branch is deleted
-        if ticket.proposal is None:
-            self.answer([(ticket, errors.Withdrawn(ticket.withdrawn))])
 
     def answer(
         self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
