@@ -104,6 +104,8 @@ def test_nothing_overflows_and_no_word_is_broken(visit: Visits, width: int) -> N
         page.screenshot(path=picture(view, str(width)), full_page=True)
         wide = page.evaluate("document.documentElement.scrollWidth")
         assert wide <= width, f"{view} is {wide} wide"
+        cut = "links => links.filter(l => l.getBoundingClientRect().right > innerWidth).length"
+        assert page.eval_on_selector_all("header nav a", cut) == 0, "the menu is cut"
         assert page.evaluate(BROKEN_WORDS) == [], view
 
 

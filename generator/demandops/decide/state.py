@@ -30,6 +30,7 @@ from demandops.decide.planning.planner import (
 )
 from demandops.model.config.appdef import ApplicationDefinition
 from demandops.model.config.config import Config
+from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.demand.demand import Application, Demand, InputTopic, Item
 from demandops.model.ledger import claim as claim_files
@@ -105,6 +106,13 @@ CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
 FileReader = Callable[[str], str | None]
 
 
+# what a change does to the pods of a release; empty if nothing
+Effect = Literal["starts", "restarts", "reconfigures", "stops", ""]
+
+# values of every chart that do not restart the pods that run
+_ALWAYS_LIVE = frozenset({"replicas", "autoscaler"})
+
+
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
     """A release that starts, changes or stops; ``details`` has a line for each changed fact."""
@@ -114,6 +122,13 @@ class ReleaseChange:
     file: str
     change: Change
     details: tuple[str, ...] = ()
+    effect: Effect = ""
+
+    @property
+    def title(self) -> str:
+        # a sign before it says what starts and what stops
+        effect = f", {self.effect}" if self.change == "change" and self.effect else ""
+        return f"{self.name} ({self.what}){effect}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,7 +229,7 @@ def render_change(
         if text is not None and text == current:
             continue
         if old or new:
-            releases.append(describe_change(old, new, current is not None))
+            releases.append(describe_change(old, new, current, text))
     _refuse_large(files, config.repo_settings.limits.file_bytes, read)
     releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
@@ -236,10 +251,13 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
         raise Refused(faults)
 
 
-def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
-    """Return how a release changes; ``existed`` says that it had a file before."""
+def describe_change(
+    old: Release | None, new: Release | None, current: str | None, text: str | None
+) -> ReleaseChange:
+    """Return how a release changes, and with it its file, from the text ``current`` to ``text``."""
     release = new or old
     assert release is not None  # noqa: S101 - a change has at least one side
+    existed = current is not None
     kind: Change = "stop" if not new else "change" if existed else "start"
     details: list[str] = []
     if new and existed:
@@ -255,7 +273,28 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
         old_facts, new_facts = frozenset(before), frozenset(after)
         details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
         details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
-    return ReleaseChange(release.name, release.description, path_of(release), kind, tuple(details))
+    effect = _effect(old, new, current, text)
+    return ReleaseChange(
+        release.name, release.description, path_of(release), kind, tuple(details), effect
+    )
+
+
+def _effect(
+    old: Release | None, new: Release | None, current: str | None, text: str | None
+) -> Effect:
+    if text is None or current is None:
+        return "stops" if text is None else "starts"
+    had, has = (getattr(side, "replicas", None) != 0 for side in (old, new))
+    if had is not has:
+        return "starts" if has else "stops"
+    (was, before), (now, after) = map(gitops.values_apart, (current, text))
+    if before != after:
+        return "restarts"
+    if was == now:  # only comments differ, which name overrides
+        return ""
+    live = {*new.service.live, *_ALWAYS_LIVE} if isinstance(new, ServiceRelease) else set()
+    differing = {name for name in {**was, **now} if was.get(name, ABSENT) != now.get(name, ABSENT)}
+    return "reconfigures" if differing <= live else "restarts"
 
 
 # ---- all generated files of a state ----
@@ -447,6 +486,31 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
     return list(dict.fromkeys(faults))
 
 
+def described(
+    before: Release | None, after: Release | None, text: str | None, new_text: str | None
+) -> ReleaseChange:
+    """Return how a release changes, by its plans and its texts before and after."""
+    change = describe_change(before, after, text, new_text)
+    if change.change != "change":
+        return change
+    paths = [path_of(side) for side in (before, after) if side]
+    if len({*paths}) > 1:
+        moved = (f"- {paths[0]}", f"+ {paths[1]}")
+        return replace(change, details=(*moved, *change.details))
+    # what overrides change is told by the fields too, such as the tag of an image
+    facts = list[str]()
+    if all(detail[2:].startswith(f"{OVERRIDES_ROOT}/") for detail in change.details):
+        with suppress(InvalidInput):
+            was, now = list(load_all(text or "")), list(load_all(new_text or ""))
+            differing = list(leaf_differences(was, now))
+            for path, *sides in differing[:_MOST_FACTS]:
+                shown = ("none" if side is ABSENT else short_repr(side) for side in sides)
+                facts.append(f"{path.removeprefix('[0].')}: {' → '.join(shown)}")
+            if len(differing) > _MOST_FACTS:
+                facts.append(f"and {len(differing) - _MOST_FACTS} more")
+    return replace(change, details=(*change.details, *facts))
+
+
 def preview(
     old: Mapping[ReleaseKey, Release],
     new: Mapping[ReleaseKey, Release],
@@ -475,21 +539,7 @@ def preview(
             continue
         of_releases |= {old_path, new_path}
         text = current.get(old_path or new_path)
-        change = describe_change(before, after, text is not None)
-        if change.change == "change" and old_path and old_path != new_path:
-            moved = (f"- {old_path}", f"+ {new_path}")
-            change = replace(change, details=(*moved, *change.details))
-        elif change.change == "change" and not change.details:
-            with suppress(InvalidInput):
-                was, now = list(load_all(text or "")), list(load_all(files.get(new_path, "")))
-                differing = list(leaf_differences(was, now))
-                facts = []
-                for path, *sides in differing[:_MOST_FACTS]:
-                    shown = ("none" if side is ABSENT else short_repr(side) for side in sides)
-                    facts.append(f"{path.removeprefix('[0].')}: {' → '.join(shown)}")
-                if len(differing) > _MOST_FACTS:
-                    facts.append(f"and {len(differing) - _MOST_FACTS} more")
-                change = replace(change, details=tuple(facts))
+        change = described(before, after, text, files.get(new_path))
         releases.append(change)
     releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
     others = tuple(sorted(changed - of_releases))

@@ -119,7 +119,7 @@ def assert_apart(repo: MemoryRepo) -> None:
 
 @pytest.mark.usefixtures("short_digests")
 @given(st.lists(st.one_of(joins, links, puts), min_size=2, max_size=14), chances)
-@examples(60)
+@examples(24)
 def test_whatever_the_ids_each_has_its_own_names_and_files_or_is_refused(
     requests: list[Goal], random: Random
 ) -> None:

@@ -10,7 +10,6 @@ from dataclasses import replace
 from datetime import timedelta
 from random import Random
 
-import pytest
 from demandops.decide.decision import Decision
 from demandops.decide.state import rendered_files
 from demandops.model.ledger import claim as claim_files
@@ -18,7 +17,7 @@ from demandops.model.ledger.claim import ClaimKey, demand_id
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.kit.chance import IN_FULL, TIMES, chances, examples, told
+from tests.kit.chance import chances, examples, told
 from tests.kit.memory import MemoryRepo, ledger_in, outcome
 from tests.model.books import Books, Demand, Result
 from tests.model.goals import SKELETON, Maker, shutdown_of
@@ -115,14 +114,6 @@ def test_bookkeeping_files_and_outcomes_are_the_models_after_every_request(
 ) -> None:
     walk = Walk(random)
     for request in told(walk.maker.sequence(length)):
-        walk.take(request)
-    walk.assert_rendered_from_the_files()
-
-
-@pytest.mark.parametrize("seed", range(2 * TIMES if IN_FULL else 1))
-def test_they_stay_the_models_over_a_long_time(seed: int) -> None:
-    walk = Walk(Random(seed))
-    for request in walk.maker.sequence(120):
         walk.take(request)
     walk.assert_rendered_from_the_files()
 

@@ -30,7 +30,7 @@ TRAILERS = st.lists(st.tuples(KEYS, VALUES), min_size=1, max_size=6)
 
 @given(paragraphs=st.lists(st.lists(VALUES, min_size=1), min_size=1, max_size=3), trailers=TRAILERS)
 @example(paragraphs=[["Join a"]], trailers=[("Requester", value) for value in HOSTILE])
-@examples(80)
+@examples(30)
 def test_trailers_are_read_back_exactly_and_nothing_else_stands_in_the_message(
     paragraphs: list[list[str]], trailers: list[tuple[str, str]]
 ) -> None:
@@ -57,7 +57,7 @@ def _trailers_of_git(repo: pygit2.Repository, text: str) -> str:
 
 @given(text=st.lists(st.sampled_from(ORDERS), min_size=1, max_size=6).map("".join))
 @example(text=" ".join(ORDERS))
-@examples(200)
+@examples(80)
 def test_no_forge_acts_on_what_a_requester_writes(repo: pygit2.Repository, text: str) -> None:
     why = f"Why: request '{text}', asks for {text}."
     paragraphs = [[f"Join {text}"], [why], ["List:", f"  {text}"]]

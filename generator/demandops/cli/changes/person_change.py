@@ -34,7 +34,7 @@ from demandops.decide.state import (
     FileReader,
     ReleaseChange,
     State,
-    describe_change,
+    described,
     planned_releases,
 )
 from demandops.model.ledger.claim import requesters_of
@@ -209,21 +209,19 @@ def commit(
         before = repo.snapshot(progress=report)
         after = person_commit.state_after(repo.repository, before, files)
 
-    def text(release: Release | None, state: State) -> object:
+    def text(release: Release | None, state: State) -> str | None:
         with suppress(InvalidInput):
-            return release and gitops.render(release, state.config, state.evaluate)
+            return gitops.render(release, state.config, state.evaluate) if release else None
         return None
 
     old, new = planned_releases(before.state), planned_releases(after)
     changes = []
     for key in {**old, **new}:
         was, now = old.get(key), new.get(key)
-        change = describe_change(was, now, key in old)
         # a release also has what no file shows, such as whether its node is drained
-        if change.change != "change" or (
-            was != now and (change.details or text(was, before.state) != text(now, after))
-        ):
-            changes.append(change)
+        if was != now:
+            change = described(was, now, text(was, before.state), text(now, after))
+            changes += [change] if change.change != "change" or change.details else []
     changes.sort(key=lambda change: (change.change, change.name))
     stopped = _stopped(old, new, repo.file_reader())
     who = {name for r in stopped for name in requesters_of(claims_of(r, before.state.ledger))}
