@@ -252,6 +252,9 @@ def test_the_hosts_network_is_refused_once_the_policy_forbids_it(world: World) -
     assert "violates PodSecurity" in domain.kube.refusal(alone)
     assert [domain.kube.refusal(one) for one in makers(pod())] == [""] * (len(others) + 1)
     domain.follow(sent.commit)
-    domain.wait_releases()
-    for deployment in domain.find("Deployment"):
-        assert "hostNetwork" not in deployment["spec"]["template"]["spec"]
+
+    def host_network() -> list[str]:
+        deployments = domain.names("Deployment")
+        return [one for one in deployments if "hostNetwork" in domain.pod_template(one)["spec"]]
+
+    domain.wait("the pods to leave the host's network", lambda: host_network() == [])

@@ -17,8 +17,6 @@ from demandops.base.strict_yaml import located_in
 from demandops.cli import output
 from demandops.cli.authoring import check
 from demandops.cli.formats import Table, print_json, show
-from demandops.model.config.base_model import parse_file
-from demandops.model.ledger.records import _WaitingFile
 from demandops.views.rows import Column
 from hypothesis import given
 from hypothesis import strategies as st
@@ -97,8 +95,3 @@ def test_faults_that_are_passed_on_are_still_counted_right() -> None:
         raise found
     *listed, last = raised.value.faults
     assert (len(listed), last.message) == (MOST_FAULTS, "has 900 more faults")
-
-
-def test_a_file_that_is_no_mapping_is_told_the_format_of_its_own_kind() -> None:
-    with pytest.raises(InvalidInput, match=r"starts with apiVersion: demandops\.ledger/v3"):
-        parse_file(_WaitingFile, "[]", "ledger/waiting/a.yaml")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from demandops.cli.main import run
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.views.kinds import rows_of
@@ -38,6 +40,15 @@ def overridden(generator: Generator) -> None:
     """Wait until the generator follows a person's override."""
     generator.fetch_now()
     wait_until(lambda: generator.snapshot.state.config.overrides, "it applies")
+
+
+def typed(page: Page, state: GitRepo) -> None:
+    """Run the command that a page shows, in earnest."""
+    (command,) = [e.text for e in page.all("pre") if e.text.strip().startswith("demandops ")]
+    _, *args = shlex.split(command.removesuffix(" --dry-run"))
+    assert (
+        command.endswith(" --dry-run") and run([*args, "-y", "--state-repo", str(state.path)]) == 0
+    )
 
 
 def test_a_denied_connection_is_told_everywhere(
@@ -140,9 +151,10 @@ def test_a_lease_is_listed_and_the_consequence_of_its_release_is_what_follows(
     assert re.match(r"mine in [0-9m]+s? vehicle02 10m vehicle02/cloud", row)
     page = look("/demand", id="mine")
     told = {e.text.strip() for e in page.all("a") if "li" in e.inside and "main" in e.inside}
-    (command,) = [e.text for e in page.all("pre")]
     before = set(state.manifests())
-    book(booked, yaml.safe_load(command.partition("<<'END'\n")[2].removesuffix("END")))
+    typed(page, state)
+    booked.fetch_now()
+    wait_until(lambda: str(booked.snapshot.commit) == state.tip, "the generator knows")
     gone = {Path(path).stem for path in before - set(state.manifests())}
     assert gone == told and len(gone) == 2
 
@@ -154,17 +166,16 @@ def test_a_lease_is_listed_and_the_consequence_of_its_release_is_what_follows(
         ("mqtt-vehicle00-edge-source-d3ca91c2df6c", "vehicle00/edge is booked, but {} denies it"),
     ],
 )
-def test_the_file_that_stops_a_release_stops_it(
-    booked: Generator, person: Person, look: Look, state: GitRepo, release: str, told: str
+def test_the_command_that_stops_a_release_stops_it(
+    booked: Generator, look: Look, state: GitRepo, release: str, told: str
 ) -> None:
     page = look("/release", name=release)
-    (text,) = [e.text for e in page.all("pre") if "kind: Override" in e.text]
-    (promise,) = [text for text in page.texts("p") if "This file would stop it" in text]
+    (promise,) = [text for text in page.texts("p") if "That stops it" in text]
     before = set(state.manifests())
-    name = text.splitlines()[0].removeprefix("# ")
-    person.change({name: text})
+    typed(page, state)
     overridden(booked)
     assert look("/release", name=release).texts("h1") != [f"Release {release} unknown"]
+    (name,) = state.files("overrides/suspend-")
     assert told.format(name) in look("/").text
     gone = {Path(path).stem for path in before - set(state.manifests())}
     assert release in gone

@@ -7,7 +7,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from math import inf
 from pathlib import Path
-from threading import Event, Timer
 
 import pytest
 from demandops.base.errors import InvalidInput
@@ -21,7 +20,7 @@ from tests.golden.cases import start
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.cluster import KubeApi, kube_api
-from tests.kit.http import Answer, Call, Server, kubeconfig, serving
+from tests.kit.http import Answer, Server, kubeconfig, serving
 from tests.kit.limits import PATIENCE_S
 from tests.kit.rig import wait_until
 
@@ -45,15 +44,6 @@ def trigger(case: str, reached: ClusterAccess, changed: list[str] | None = None)
     made = ReconcileTrigger({"c-its": reached}, lambda since: ("b" * 40, changed))
     made(state.config)
     made.close()
-
-
-def test_a_file_names_each_cluster_and_how_it_is_reached(tmp_path: Path) -> None:
-    file = tmp_path / "clusters.yaml"
-    file.write_text(
-        f"{HEAD}clusters: {{a: {{kubeconfig: /x}}, b: {{receiver: https://h/hook/1}}}}\n"
-    )
-    clusters = clusters_file.read(file).clusters
-    assert (clusters["a"].kubeconfig, clusters["b"].receiver) == (Path("/x"), "https://h/hook/1")
 
 
 @pytest.mark.parametrize(("access", "secret", "mode", "field", "told"), TABLES["mistakes"])
@@ -138,25 +128,6 @@ def test_a_push_waits_until_flux_is_idle_which_the_end_does_not_miss(
     fetch_and_apply(api, "b")
     waker.close()
     assert len(api.patches) == 2
-
-
-def test_a_push_during_the_last_call_is_told_at_the_end_too() -> None:
-    state, _ = start("experiment")
-    is_closing = Event()
-
-    def answer(call: Call) -> Answer:
-        is_closing.wait(PATIENCE_S)
-        return Answer()
-
-    with serving(answer) as server:
-        reached = ClusterAccess(receiver=f"{server.url}/hook/abc")
-        waker = ReconcileTrigger({"c-its": reached}, lambda since: ("", None))
-        waker(state.config)
-        wait_until(lambda: len(server.calls) == 1, "the first call")
-        waker(state.config)
-        Timer(0.2, is_closing.set).start()
-        waker.close()
-        assert len(server.calls) == 2
 
 
 def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody(

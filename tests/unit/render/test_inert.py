@@ -28,7 +28,7 @@ NODES = "inventory/nodes.yaml"
 
 _TEXTS = plain_yaml.beside(__file__)
 TRAPS, UNSEEN, LABELS = (_TEXTS[name] for name in ("traps", "unseen", "labels"))
-IDS = [text for text in TRAPS if one_form(text) == text]
+IDS = [text for text in (*TRAPS, "x", "x-watcher") if one_form(text) == text]
 
 
 class Core(FAST):  # type: ignore[misc]
@@ -112,6 +112,9 @@ def test_ids_are_read_back_as_they_were() -> None:
     assert sorted(claimed) == sorted(IDS * 2)
     for content in books.rendered().values():
         assert_unmistakable(content)
+    texts = "".join(books.rendered().values())
+    names = re.findall(r"nodeName: (\S+)", texts)
+    assert len({*names}) == len(names), "a service and a watcher have one name"
     ends = [item["metadata"]["annotations"] for item in books.objects("Deployment").values()]
     assert sorted(end["demandops/connection"] for end in ends) == sorted(IDS * 2)
     for end in ends:

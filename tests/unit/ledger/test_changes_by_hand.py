@@ -1,6 +1,6 @@
-"""What people write in Git, an upgrade and a restoration leave of the output topics' names.
+"""What people write in Git, an upgrade and a restoration leave of output topics and carriers.
 
-The rules for demands are in ``tests/scenarios``.
+The rules for demands are in ``tests/scenarios``, ``test_flows`` and ``test_properties``.
 """
 
 from __future__ import annotations
@@ -9,11 +9,13 @@ from dataclasses import replace
 from typing import Any
 
 import yaml
+from demandops.connections.connection import Connection
 from demandops.decide.booking import Restoration
+from demandops.decide.carriers import with_one_carrier
 from demandops.decide.edits import faults_of_edit
 from demandops.decide.planning.flows import with_booked_topics_marked
 from demandops.model.ledger.claim import Claim, path_of
-from demandops.model.ledger.ledger import ClaimChange
+from demandops.model.ledger.ledger import ClaimChange, ledger_of
 
 from tests.kit.config import skeleton
 from tests.kit.goals import APP, CLOUD, Topic, application, connection, goal
@@ -121,3 +123,55 @@ def test_an_upgrade_takes_the_oldest_cloud_for_the_usual_one() -> None:
     apps = (claim.application for claim in marked if claim.is_on_application)
     inputs = [topic for app in apps for topic in app.inputs["point_cloud"]]
     assert {topic.topic: topic.further for topic in inputs} == {FRONT[0]: False, REAR[0]: True}
+
+
+# ---- which connection carries a route ----
+
+
+def listing(demand: str, id: str, *topics: dict[str, Any]) -> dict[str, Any]:
+    ends = {"id": id, "source": "vehicle00", "target": "edge", "topics": list(topics)}
+    return {"kind": "Demand", "demand": demand, "requesters": [demand], "connections": [ends]}
+
+
+def doubled() -> list[Claim]:
+    """Return the claims of two demands that list one route, as each would hold it alone."""
+    late = listing("late", "new", {"source": "/a", "qos": 1}, {"source": "/b"})
+    claims = []
+    for hour, asked in ((11, late), (9, listing("early", "old", {"source": "/a"}))):
+        repo = MemoryRepo()
+        repo.send(asked, repo.now.replace(hour=hour))
+        claims += list(repo.state.ledger)
+    return claims
+
+
+def test_an_upgrade_gives_a_route_to_the_oldest_connection_that_has_it() -> None:
+    ledger, keys = with_one_carrier(ledger_of(doubled()))
+    held = {
+        (claim.subject.id, claim.demand): [(r.source, r.qos, r.listed) for r in claim.held.topics]
+        for claim in ledger
+        if isinstance(claim.held, Connection)
+    }
+    assert held == {
+        ("old", "early"): [("/a", 0, "")],
+        ("old", "late"): [("/a", 0, "new")],
+        ("new", "late"): [("/b", 0, "")],
+    }
+    assert {key.subject.id for key in keys} == {"old", "new"}
+    assert with_one_carrier(ledger) == (ledger, [])
+
+
+def test_a_claim_by_hand_that_doubles_a_route_is_invalid_and_a_restored_one_is_united() -> None:
+    late, early = doubled()
+    repo = MemoryRepo()
+    before = replace(repo.state, ledger=ledger_of([early]))
+    after = replace(repo.state, ledger=ledger_of([early, late]))
+    (found,) = faults_of_edit(before, after, [ClaimChange(None, late)])
+    assert (found.file, found.field) == (path_of(late.key), "topics[0]")
+    assert "connection 'old' carries this topic" in found.message
+    repo.send(Restoration(id="rollback", claims=(late, early)))
+    carried = {
+        (claim.subject.id, route.source)
+        for claim in repo.state.ledger
+        for route in claim.connection.topics
+    }
+    assert carried == {("old", "/a"), ("new", "/b")}
