@@ -25,6 +25,7 @@ from demandops.web.server import Site
 from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import DENY, VIEWS, Look, causes
+from tests.integration.web.html import Page
 from tests.kit import goals
 from tests.kit.config import override
 from tests.kit.limits import PATIENCE_S
