@@ -278,7 +278,7 @@ plant("run_what_is_denied", 14, planner, "without_suspended", itself)
 plant("book_what_is_denied", 3, forbidden, "denial_faults", lambda *_: ())
 
 
-@wrong(10, edits, "expired_overrides")
+@wrong(0, edits, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
 
@@ -430,7 +430,7 @@ def _forget_proposal(read: Any, path: Any) -> dict[str, Ticket]:
     return found
 
 
-@wrong(3, permission, "approval")
+@wrong(0, permission, "approval")
 def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> Any:
     return ((), ()) if request.demand in _known else reasons(request, *more)
 
