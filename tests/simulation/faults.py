@@ -99,8 +99,8 @@ def in_reverse(right: Wrong, *given: Any) -> Any:
 # ---- booking ----
 
 
-plant("let_strangers_change_a_demand", 0, permission, "stranger_faults", lambda *_: ())
-plant("release_only_the_first_claim", 43, booking, "claims_of", first_only)
+plant("let_strangers_change_a_demand", 3, permission, "stranger_faults", lambda *_: ())
+plant("release_only_the_first_claim", 161, booking, "claims_of", first_only)
 plant("replace_what_was_joined", 2, Application, "extended", lambda _, app, more: more)
 plant("replace_what_was_joined", 2, Connection, "extended", lambda _, connection, more: more)
 plant("grant_one_claim_too_many", 4, forbidden, "_held", lambda held, *given: held(*given) - 1)
@@ -125,7 +125,7 @@ def let_a_shutdown_end_any_join_of_its_request(shut_down: Any, ledger: Any, aske
     return shut_down(ledger, replace(asked, demanded=tuple(made)))
 
 
-@wrong(0, permission, "stranger_faults")
+@wrong(3, permission, "stranger_faults")
 def take_one_common_requester_for_the_owner(
     faults: Any, request: Any, owners: Any, *more: Any
 ) -> Any:
@@ -148,13 +148,13 @@ def lose_renewals(started: Any, lease: Any, now: Any, before: Any = None) -> Any
     return before or started(lease, now)
 
 
-plant("end_leases_by_the_wall_clock", 1, Agenda, "_has_grace", lambda *_: False)
+plant("end_leases_by_the_wall_clock", 3, Agenda, "_has_grace", lambda *_: False)
 
 
 plant("never_scale", 1, planner, "_replicas_of", lambda _, scaling, *more: scaling.min)
 
 
-@wrong(0, planner, "_replicas_of")
+@wrong(3, planner, "_replicas_of")
 def exceed_the_most_replicas(_: Any, scaling: Any, parameters: Any, topics: Any, *more: Any) -> int:
     return len(topics) or 1
 
@@ -183,7 +183,7 @@ def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: An
 plant("take_the_first_domain", 3, Config, "nodes_of", lambda _, config, node: (node,))
 
 
-@wrong(13, completing, "_chosen")
+@wrong(1, completing, "_chosen")
 def forget_what_is_booked_in_a_domain(chosen: Any, one: Any, booked: Any, *more: Any) -> Any:
     return chosen(one, {}, *more)
 
@@ -196,7 +196,7 @@ def carry_only_the_first_demands_routes(topics: Any, claims: Any) -> Any:
     return topics([*claims][:1])
 
 
-@wrong(1, connection, "merged_routes")
+@wrong(0, connection, "merged_routes")
 def name_a_shared_route_twice(_: Any, routes: Any) -> Any:
     return tuple(sorted(routes, key=lambda one: one.source))
 
@@ -236,13 +236,13 @@ def begin_the_wait_anew(
 
 plant("forget_those_that_wait", 7, Agenda, "may_have_room", nothing)
 plant("let_others_overtake_in_a_batch", 7, Agenda, "book_those_let_in", nothing)
-plant("leave_drained_nodes_full", 0, agenda, "_to_drain", lambda *_: [])
+plant("leave_drained_nodes_full", 3, agenda, "_to_drain", lambda *_: [])
 plant("place_on_drained_nodes", 12, Choice, "_closed", lambda *_: "")
-plant("choose_anew_for_a_placed_demand", 15, placement, "_booked", nothing)
+plant("choose_anew_for_a_placed_demand", 14, placement, "_booked", nothing)
 plant("count_no_room", 7, forbidden, "excesses", lambda *_: [])
 
 
-@wrong(2, Usage, "plus")
+@wrong(0, Usage, "plus")
 def count_released_room_as_taken(plus: Any, usage: Any, more: Any) -> Any:
     return plus(usage, {need: n for need, n in more.items() if n > 0})
 
@@ -263,13 +263,13 @@ def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any
     return Changeset({**(more or {})}, ())
 
 
-@wrong(26, World, "__post_init__")
+@wrong(151, World, "__post_init__")
 def let_the_lowest_priority_win(right: Any, world: Any) -> None:
     right(world)
     object.__setattr__(world, "overrides", world.overrides[::-1])
 
 
-@wrong(0, overrides, "fits")
+@wrong(9, overrides, "fits")
 def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bool:
     return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
 
@@ -283,7 +283,7 @@ def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
 
 
-@wrong(0, agenda, "_ends")
+@wrong(3, agenda, "_ends")
 def end_overrides_early_one_by_one(ends: Any, state: Any) -> Any:
     return [(end - timedelta(minutes=2), name) for end, name in ends(state)]
 
