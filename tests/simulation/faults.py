@@ -143,7 +143,7 @@ def take_back_promised_leases(started: Any, lease: Any, now: Any, before: Any = 
     return started(lease, now)
 
 
-@wrong(0, Lease, "started")
+@wrong(7, Lease, "started")
 def lose_renewals(started: Any, lease: Any, now: Any, before: Any = None) -> Any:
     return before or started(lease, now)
 
@@ -222,8 +222,8 @@ plant("leave_the_far_end", 0, ConnectionType, "keys", first_only)
 
 # ---- placement ----
 
-plant("let_the_last_in_first", 52, agenda, "in_turn", in_reverse)
-plant("ignore_priorities", 52, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
+plant("let_the_last_in_first", 16, agenda, "in_turn", in_reverse)
+plant("ignore_priorities", 98, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
 
 
 @wrong(3, decision, "_wait")
@@ -237,7 +237,7 @@ def begin_the_wait_anew(
 plant("forget_those_that_wait", 7, Agenda, "may_have_room", nothing)
 plant("let_others_overtake_in_a_batch", 7, Agenda, "book_those_let_in", nothing)
 plant("leave_drained_nodes_full", 3, agenda, "_to_drain", lambda *_: [])
-plant("place_on_drained_nodes", 12, Choice, "_closed", lambda *_: "")
+plant("place_on_drained_nodes", 1, Choice, "_closed", lambda *_: "")
 plant("choose_anew_for_a_placed_demand", 14, placement, "_booked", nothing)
 plant("count_no_room", 7, forbidden, "excesses", lambda *_: [])
 
@@ -274,7 +274,7 @@ def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bo
     return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
 
 
-plant("run_what_is_denied", 14, planner, "without_suspended", itself)
+plant("run_what_is_denied", 29, planner, "without_suspended", itself)
 plant("book_what_is_denied", 3, forbidden, "denial_faults", lambda *_: ())
 
 
@@ -387,12 +387,12 @@ plant("say_that_all_is_withdrawn", 1, Demands, "withdraw", lambda *_: True)
 plant("forget_the_journal", 0, journal, "read", lambda *_: {})
 
 
-@wrong(9, journal.Journal, "_write")
+@wrong(1, journal.Journal, "_write")
 def leave_the_journal_in_memory(write: Any, made: Any, records: Any, *, durably: bool) -> None:
     write(made, records, durably=False)
 
 
-@wrong(0, journal.Journal, "_rewrite")
+@wrong(1, journal.Journal, "_rewrite")
 def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
     made.pending = dict([*made.pending.items()][-1:])
     rewrite(made)
@@ -401,10 +401,10 @@ def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
 plant(
     "resume_in_reverse", 15, journal, "read", lambda read, path: dict([*read(path).items()][::-1])
 )
-plant("skip_the_search_for_operations", 2, Worker, "_published_before", lambda *_: [])
+plant("skip_the_search_for_operations", 16, Worker, "_published_before", lambda *_: [])
 
 
-@wrong(0, snapshot, "start_at")
+@wrong(50, snapshot, "start_at")
 def start_without_overrides(first: Any, *given: Any) -> Any:
     found = first(*given)
     config = replace(found.state.config, overrides={})
