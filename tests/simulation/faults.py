@@ -263,7 +263,7 @@ def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any
     return Changeset({**(more or {})}, ())
 
 
-@wrong(16, World, "__post_init__")
+@wrong(151, World, "__post_init__")
 def let_the_lowest_priority_win(right: Any, world: Any) -> None:
     right(world)
     object.__setattr__(world, "overrides", world.overrides[::-1])
