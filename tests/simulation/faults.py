@@ -263,7 +263,7 @@ def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any
     return Changeset({**(more or {})}, ())
 
 
-@wrong(16, World, "__post_init__")
+@wrong(151, World, "__post_init__")
 def let_the_lowest_priority_win(right: Any, world: Any) -> None:
     right(world)
     object.__setattr__(world, "overrides", world.overrides[::-1])
@@ -278,7 +278,7 @@ plant("run_what_is_denied", 14, planner, "without_suspended", itself)
 plant("book_what_is_denied", 3, forbidden, "denial_faults", lambda *_: ())
 
 
-@wrong(10, edits, "expired_overrides")
+@wrong(0, edits, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
 
@@ -430,7 +430,7 @@ def _forget_proposal(read: Any, path: Any) -> dict[str, Ticket]:
     return found
 
 
-@wrong(3, permission, "approval")
+@wrong(0, permission, "approval")
 def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> Any:
     return ((), ()) if request.demand in _known else reasons(request, *more)
 

@@ -29,20 +29,18 @@ from tests.integration.web.html import Page
 from tests.kit import goals
 from tests.kit.config import override
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import GitRepo, Person, away, git
-from tests.kit.rig import Proposed, book, running, wait_until
+from tests.kit.repo import GitRepo, Person, away
+from tests.kit.rig import book, running, wait_until
 
 LINK = {"id": "vehicle02/cloud", "type": "mqtt", "source": "vehicle02", "target": "cloud"}
 LINK |= {"topics": [{"source": "/t"}]}
 DETECTION = "od-edge-vehicle00"
 
 
-def overridden(generator: Generator, overrides: int = 1) -> None:
-    """Wait until the generator follows a person's overrides."""
+def overridden(generator: Generator) -> None:
+    """Wait until the generator follows a person's override."""
     generator.fetch_now()
-    wait_until(
-        lambda: len(generator.snapshot.state.config.overrides) == overrides, "overrides apply"
-    )
+    wait_until(lambda: generator.snapshot.state.config.overrides, "it applies")
 
 
 def typed(page: Page, state: GitRepo) -> None:
@@ -146,27 +144,6 @@ def test_an_invalid_file_names_who_wrote_it_and_too_many_causes_are_counted(
     assert page.texts("h1") == ["2 things need attention"]
 
 
-def test_a_proposal_names_its_commit_and_how_to_approve_just_that(
-    booked: Generator, state: GitRepo, person: Person, look: Look, follower: Follower
-) -> None:
-    person.policy(approval="required")
-    booked.fetch_now()
-    wait_until(lambda: not _approved(booked), "demands need approval")
-    proposed = Proposed(booked, goals.goal([goals.application("edge/new", who=["v"])], []))
-    branch = proposed.branch
-    wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
-    commit = git(state.path, "rev-parse", branch)
-    approve = f"demandops approve {branch} --commit {commit}"
-    assert approve in look("/").text
-    shown = look("/proposals").text
-    assert commit in shown and approve in shown
-    assert approve.replace("approve", "reject") in shown
-
-
-def _approved(generator: Generator) -> bool:
-    return generator.snapshot.state.config.domains["perception"].approval == "none"
-
-
 def test_a_lease_is_listed_and_the_consequence_of_its_release_is_what_follows(
     booked: Generator, look: Look, state: GitRepo
 ) -> None:
@@ -205,32 +182,6 @@ def test_the_command_that_stops_a_release_stops_it(
     assert release in gone
     named = {word for word in re.split(r"[ ,.]+", promise) if word.startswith(("od-", "mqtt-"))}
     assert named == gone - {release}
-
-
-def test_an_override_that_another_holds_back_is_told(
-    booked: Generator, person: Person, look: Look
-) -> None:
-    fusion = {"services": ["object-fusion"]}
-    person.override(
-        frozen=override(fusion, hold=True, priority=1), more=override(fusion, replicas=2)
-    )
-    overridden(booked, 2)
-    assert "held back" in look("/overrides").text
-
-
-def test_a_span_of_the_time_line_lists_only_its_events(booked: Generator, look: Look) -> None:
-    def commits(page: Page) -> list[str]:
-        return [text.split()[-1] for text in page.texts("tr")[1:]]
-
-    everything = look("/timeline", span="all")
-    assert len(commits(everything)) == 3 and "Create the state repo" in everything.text  # long ago
-    page = look("/timeline", span="15min")
-    assert commits(page) == commits(everything)[:2]
-    assert "2 events in the last 15min" in page.text
-    dots = [title for title in page.texts("title") if " UTC, " in title]
-    more = [int(count) for title in dots for count in re.findall(r"and (\d+) more", title)]
-    assert len(dots) + sum(more) == 2  # the drawing has the same events as the list
-    assert len(commits(look("/timeline", span="7d", q="who:vehicle01"))) == 1
 
 
 def test_the_command_serves_the_page_until_it_is_stopped(bare: Path) -> None:
