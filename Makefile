@@ -153,7 +153,6 @@ golden: setup  ## Rewrite the golden files, and the schemas and tables of the ch
 	@$(PY) -m tests.unit.messages
 
 bench: system-page setup  ## Measure the event detector, the page, and the cost of commits and demands as the ledger grows
-	@$(PY) -m tests.benchmarks.commits
 	@$(PY) -m tests.benchmarks.growth
 	@$(PY) -m tests.benchmarks.detector
 	@$(PY) -m tests.benchmarks.page
@@ -169,7 +168,7 @@ fuzz: export FUZZ_S ?= 10
 fuzz: system-test setup  ## Try odd inputs on every parser and writer, each for FUZZ_S seconds (default 10)
 	@$(PY) -m tests.fuzz
 
-simulate: setup  ## Find 61 planted faults, then simulate generators, people and faults for SIMULATE_S=60 seconds from SEED
+simulate: setup  ## Find 64 planted faults, then simulate generators, people and faults for SIMULATE_S=60 seconds from SEED
 	@$(PY) -m pytest -q -n auto $(SIMULATION_TESTS)
 	@$(PY) -m tests.simulation.run
 

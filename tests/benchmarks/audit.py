@@ -12,7 +12,6 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-import pygit2
 from demandops.repo import reader
 from demandops.serve.generator import Generator
 
@@ -26,20 +25,19 @@ BATCH = 500
 
 def lay_down(folder: Path) -> Path:
     """Make a state repo with a fleet, and carry out the goals there; return its path."""
-    laid = fleet.lay_down(folder / "state-repo.git", RELEASES)
-    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # no fsync while the repo is made
-    with closing(Generator(str(laid.path), data=folder / "data")) as generator:
+    edges = fleet.edges_for(RELEASES)
+    laid = fleet.lay_down(folder / "state-repo.git", edges)
+    with fleet.no_fsync(), closing(Generator(str(laid), data=folder / "data")) as generator:
         for first in range(0, COMMITS, BATCH):
             tickets = []
             for number in range(first, min(first + BATCH, COMMITS)):
-                edge = (number // 2) % laid.edges
-                vehicle = fleet.spare_id(edge)
-                goal = fleet.goal(fleet.edge_id(edge), vehicle, shutdown=number % 2 == 1)
+                edge = number // 2 % edges
+                vehicle, leaves = fleet.spare_id(edge), number % 2 == 1
+                goal = fleet.goal(fleet.edge_id(edge), vehicle, shutdown=leaves)
                 tickets.append(generator.submit(goal))
             for ticket in tickets:
                 ticket.future.result()
-    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
-    return laid.path
+    return laid
 
 
 def timed(what: str, call: Callable[[], object]) -> None:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,13 +39,8 @@ EDGES_PER_CLUSTER = VEHICLES_PER_EDGE = 10
 RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
 
 
-@dataclass(frozen=True)
-class Fleet:
-    """The state repo of a fleet, and how many edges and releases the fleet has."""
-
-    path: Path
-    edges: int
-    releases: int
+def edges_for(releases: int) -> int:
+    return max(1, round(releases / RELEASES_PER_EDGE))
 
 
 def edge_id(number: int) -> str:
@@ -84,45 +79,32 @@ def _region(number: int) -> str:
     return f"region{number // EDGES_PER_CLUSTER:04d}"
 
 
-def _nodes(edges: int, vehicles: int) -> str:
-    nodes: list[dict[str, str]] = [{"id": "cloud", "type": "cloud", "cluster": _region(0)}]
-    for number in range(edges):
-        edge = edge_id(number)
-        region = _region(number)
-        nodes.append({"id": edge, "type": "edge", "cluster": region})
-        names = [vehicle_id(number, place) for place in range(vehicles)] + [spare_id(number)]
-        nodes += [{"id": name, "type": "vehicle", "cluster": region} for name in names]
-    return _file("Nodes", nodes=nodes)
-
-
 def _file(kind: str, **lists: object) -> str:
     return strict_yaml.dump({"apiVersion": "demandops/v1", "kind": kind} | lists)
 
 
-def lay_down(path: Path, releases: int) -> Fleet:
-    """Make a bare state repo in which about ``releases`` releases run; return the fleet."""
-    edges = max(1, round(releases / RELEASES_PER_EDGE))
-    _lay_down(path, edges, VEHICLES_PER_EDGE, 0)
-    return Fleet(path, edges, edges * RELEASES_PER_EDGE)
+def _inventory(edges: int, vehicles: int) -> dict[str, str]:
+    nodes = [{"id": "cloud", "type": "cloud", "cluster": _region(0)}]
+    for number in range(edges):
+        region, places = _region(number), range(vehicles)
+        nodes.append({"id": edge_id(number), "type": "edge", "cluster": region})
+        names = [*(vehicle_id(number, place) for place in places), spare_id(number)]
+        nodes += [{"id": name, "type": "vehicle", "cluster": region} for name in names]
+    clusters = [{"name": region} for region in sorted({_region(number) for number in range(edges)})]
+    broker = {"node": "cloud", "host": "broker", "port": 1883}
+    return {
+        "inventory/nodes.yaml": _file("Nodes", nodes=nodes),
+        "inventory/clusters.yaml": _file("Clusters", clusters=clusters),
+        "inventory/brokers.yaml": _file("Brokers", brokers=[broker]),
+    }
 
 
-def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
-    """Make a state repo with an application of many vehicles; ``further`` ones demand nothing."""
-    _lay_down(path, 1, vehicles, further)
-    return path
-
-
-def _lay_down(path: Path, edges: int, vehicles: int, further: int) -> None:
-    files = configuration()
+def lay_down(path: Path, edges: int, vehicles: int = VEHICLES_PER_EDGE) -> Path:
+    """Make a bare state repo of a fleet, in which each vehicle demands the fusion of its edge."""
+    files = configuration() | _inventory(edges, vehicles)
     limits = {"demandItems": 100_000, "demandCharacters": 10_000_000, "fileBytes": 10_000_000}
     limits["decisionMilliseconds"] = 60_000
     files["demandops.yaml"] += strict_yaml.dump({"limits": limits})
-    files["inventory/nodes.yaml"] = _nodes(edges, vehicles + further)
-    regions = sorted({_region(number) for number in range(edges)})
-    clusters = [{"name": region} for region in regions]
-    files["inventory/clusters.yaml"] = _file("Clusters", clusters=clusters)
-    broker = {"node": "cloud", "host": "broker", "port": 1883}
-    files["inventory/brokers.yaml"] = _file("Brokers", brokers=[broker])
     config = load(files)
     state, now = state_of(config), datetime.now(timezone.utc)
     ledger = Ledger()
@@ -133,11 +115,18 @@ def _lay_down(path: Path, edges: int, vehicles: int, further: int) -> None:
     files |= {claim_files.path_of(claim.key): claim_files.text_of(claim) for claim in ledger}
     files |= rendered_files(State(config, ledger, state.evaluate))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
-    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # no fsync for now
-    tree = write_tree(repo, None, files)
-    who = commit_message.generator_signature(now)
-    text = "A fleet\n\nOperation: init\nRender-Version: 3\n"
-    repo.create_commit("refs/heads/main", who, who, text, tree, [])
+    with no_fsync():
+        tree = write_tree(repo, None, files)
+        who = commit_message.generator_signature(now)
+        text = "A fleet\n\nOperation: init\nRender-Version: 3\n"
+        repo.create_commit("refs/heads/main", who, who, text, tree, [])
+    return path
+
+
+@contextmanager
+def no_fsync() -> Iterator[None]:
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)
+    yield
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 
 

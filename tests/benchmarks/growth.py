@@ -1,81 +1,81 @@
-"""Measure the cost of a demand, by the vehicles of its application and by the topics it lists.
+"""Measure the cost of a demand, by the releases, vehicles and topics that there are.
 
-A vehicle joins and leaves an application that 10 to 1,000 other vehicles hold. A goal lists 10,
-1,000 or 8,000 topics. The benchmark measures wall-clock time and CPU time from ``submit`` to the
-receipt in a running generator, and the time of the generator's start. The sizes take turns in one
-process, so that other work on the machine affects all of them alike.
+A vehicle joins and leaves: beside 100 to 10,000 releases, an application that 10 to 1,000 other
+vehicles hold, or with a goal that lists 10 to 8,000 topics. The benchmark measures wall-clock time
+and CPU time from ``submit`` to the receipt of a durable commit, and the time of the generator's
+start. The sizes of a table take turns in one process, so that other work on the machine affects all
+of them alike.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
 from pathlib import Path
 
 from demandops.serve.generator import Generator
 
 from tests.benchmarks import fleet
 
-VEHICLES = (10, 100, 200, 1_000)
-TOPICS = (10, 1_000, 8_000)
-ROUNDS, ROUNDS_OF_TOPICS = 40, 3
-WARM_UP = 20
-
-Row = dict[str, float]
+WARM_UP = 4
+NAMES = ("join_ms", "join_cpu_ms", "leave_ms", "leave_cpu_ms")
 
 
-def measure(
-    folder: Path, sizes: dict[int, int], rounds: int, ego: Callable[[int, int], list[str]]
-) -> list[Row]:
-    """Return a row for each size: what the join and the leave of one more vehicle cost.
+@dataclass(frozen=True)
+class Case:
+    size: int
+    edges: int = 1
+    vehicles: int = fleet.VEHICLES_PER_EDGE
+    topics: int = 1
 
-    ``sizes`` maps each size to the number of vehicles that hold the application. A size is what
-    the rows vary: the number of vehicles, or of topics in a goal. ``ego`` takes a size and a goal's
-    number, and returns the goal's ego topics.
-    """
-    generators: dict[int, Generator] = {}
-    rows: dict[int, Row] = {}
-    costs: dict[int, list[tuple[float, ...]]] = {size: [] for size in sizes}
+
+TABLES = {
+    "releases": (30, [Case(size, edges=fleet.edges_for(size)) for size in (100, 10_000)]),
+    "vehicles": (40, [Case(size, vehicles=size) for size in (10, 100, 200, 1_000)]),
+    "topics": (3, [Case(size, topics=size) for size in (10, 1_000, 8_000)]),
+}
+"""For each table, how often to measure, and its sizes."""
+
+
+def measure(folder: Path, rounds: int, cases: list[Case]) -> list[dict[str, float]]:
+    """Return a row for each case: medians, the 99th percentile of a join, and the start."""
+    generators, starts = list[Generator](), list[float]()
+    costs: list[list[tuple[float, ...]]] = [[] for _ in cases]
     with ExitStack() as open_ones:
-        for size, vehicles in sizes.items():
-            laid = fleet.lay_down_crowd(folder / f"{size}.git", vehicles, rounds + WARM_UP)
+        for case in cases:
+            laid = fleet.lay_down(folder / f"{case.size}.git", case.edges, case.vehicles)
             start = time.perf_counter()
-            generators[size] = Generator(str(laid), data=folder / f"data{size}")
-            rows[size] = {"size": size, "start_ms": (time.perf_counter() - start) * 1e3}
-            open_ones.callback(generators[size].close)
+            made = Generator(str(laid), data=folder / f"data{case.size}")
+            generators.append(open_ones.enter_context(closing(made)))
+            starts.append((time.perf_counter() - start) * 1e3)
         for number in range(rounds + WARM_UP):
-            for size, vehicles in sizes.items():
-                edge, vehicle = fleet.edge_id(0), fleet.vehicle_id(0, vehicles + number)
-                join = fleet.goal(edge, vehicle, ego=ego(size, number))
+            for index, case in enumerate(cases):
+                edge = number * 7 % case.edges
+                ego = [f"/t{number}/n{topic}" for topic in range(case.topics)]
+                join = fleet.goal(fleet.edge_id(edge), fleet.spare_id(edge), ego=ego)
                 both = (join, join | {"shutdown": True})
-                costs[size].append(
-                    tuple(one for goal in both for one in fleet.costs(generators[size], goal))
-                )
-    for size, row in rows.items():
-        names = ("join_ms", "join_cpu_ms", "leave_ms", "leave_cpu_ms")
-        medians = map(statistics.median, zip(*costs[size][WARM_UP:], strict=True))
-        row |= {name: median * 1e3 for name, median in zip(names, medians, strict=True)}
-        row["cpu_ratio"] = row["join_cpu_ms"] / next(iter(rows.values()))["join_cpu_ms"]
-    return [*rows.values()]
+                took = (one for each in both for one in fleet.costs(generators[index], each))
+                costs[index].append(tuple(took))
+    rows = []
+    for case, start, found in zip(cases, starts, costs, strict=True):
+        columns = [sorted(each) for each in zip(*found[WARM_UP:], strict=True)]
+        row = {"size": case.size, "start_ms": start}
+        row |= {
+            name: statistics.median(each) * 1e3 for name, each in zip(NAMES, columns, strict=True)
+        }
+        row["join_p99_ms"] = columns[0][int((rounds - 1) * 0.99)] * 1e3
+        rows.append(row)
+    return rows
 
 
 def main() -> None:
-    with fleet.workspace() as folder:
-        same = {size: size for size in VEHICLES}
-        vehicles = measure(Path(folder), same, ROUNDS, lambda size, number: [])
-    with fleet.workspace() as folder:
-        topics = measure(
-            Path(folder),
-            dict.fromkeys(TOPICS, 10),
-            ROUNDS_OF_TOPICS,
-            lambda size, number: [f"/t{number}/n{index}" for index in range(size)],
-        )
-    tables = {"vehicles": vehicles, "topics": topics}
-    fleet.report(
-        "growth", **{f"One more demand, by {name} (medians)": t for name, t in tables.items()}
-    )
+    tables = {}
+    for name, (rounds, cases) in TABLES.items():
+        with fleet.workspace() as folder:
+            tables[f"One more demand, by {name}"] = measure(Path(folder), rounds, cases)
+    fleet.report("growth", **tables)
 
 
 if __name__ == "__main__":

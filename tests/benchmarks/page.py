@@ -75,9 +75,9 @@ def main() -> None:
     rows = []
     with TemporaryDirectory() as folder, chromium() as browser:
         os.environ["DEMANDOPS_DATA_HOME"] = f"{folder}/home"
-        laid = fleet.lay_down(Path(folder) / "state-repo.git", RELEASES)
-        generator = Generator(str(laid.path))
-        follower = Follower(Reader.of(str(laid.path)), {}, 0)
+        laid = fleet.lay_down(Path(folder) / "state-repo.git", fleet.edges_for(RELEASES))
+        generator = Generator(str(laid))
+        follower = Follower(Reader.of(str(laid)), {}, 0)
         server = WebServer("127.0.0.1:0", "--listen", follower)
         release = next(iter(follower.newest.releases))
         for view in (*VIEWS, f"release?name={release}"):

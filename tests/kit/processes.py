@@ -13,15 +13,9 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import count
 from pathlib import Path
 from typing import Any
 
-from demandops.model.demand.goals import read_journaled
-from demandops.repo.git.remote_repository import RemoteRepository
-from demandops.repo.git.repository import StateRepository
-from demandops.repo.write.commit_batch import CommitBatch
-from demandops.repo.write.proposal_branch import ProposalBranches
 from demandops.serve import agenda
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Journal, Receipt, Ticket
@@ -43,7 +37,6 @@ def demand(name: str, made: Goal, operation: str | None = None) -> dict[str, Any
 class Told:
     sent: list[str] = field(default_factory=list)
     answers: dict[str, dict[str, Any]] = field(default_factory=dict)
-    withdrawn: list[str] = field(default_factory=list)
     finished: bool | None = None
 
 
@@ -68,8 +61,6 @@ class Run:
                     self._told.sent.append(event["sent"])
                 elif "answer" in event:
                     self._told.answers[event["answer"]] = event
-                elif "withdrawn" in event:
-                    self._told.withdrawn.append(event["withdrawn"])
                 elif "failed" in event:
                     raise AssertionError(f"the driver failed: {event['failed']}")
                 else:
@@ -100,18 +91,17 @@ class Drivers:
         address: str | Path,
         lanes: list[list[dict[str, Any]]],
         *,
-        opening: dict[str, Any] | None = None,
-        die_at: str = "",
+        dies: bool = False,
         cwd: Path | None = None,
     ) -> Run:
+        """Start a generator; if it ``dies``, it does so once its first demands are journaled."""
         pipe = self._folder / f"run-{len(list(self._folder.iterdir()))}"
         os.mkfifo(pipe)
         names = [*GIT_ENVIRONMENT, "DEMANDOPS_DATA_HOME"]
         plan = {
             "address": str(address),
             "lanes": lanes,
-            "opening": opening,
-            "die_at": die_at,
+            "dies": dies,
             "synced": self.synced,
             "cwd": str(cwd or Path.cwd()),
             "environment": {name: os.environ[name] for name in names},
@@ -155,71 +145,23 @@ def tell(**event: object) -> None:
     os.write(1, (json.dumps(event)[:4000] + "\n").encode())
 
 
-_POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
-    "journaled": (True, [(Journal, "append")]),
-    "committed": (True, [(CommitBatch, "commit")]),
-    "locked": (False, [(StateRepository, "publish")]),
-    "publishing": (False, [(RemoteRepository, "publish"), (StateRepository, "publish")]),
-    "published": (True, [(RemoteRepository, "publish"), (StateRepository, "publish")]),
-    "unanswered": (True, [(Journal, "mark_done")]),
-    "proposing": (False, [(ProposalBranches, "put")]),
-    "proposed": (True, [(ProposalBranches, "put")]),
-    "retracting": (False, [(ProposalBranches, "remove")]),
-}
-"""For each point: whether to kill the process after or before a call of one of the functions."""
+def die_once_journaled() -> None:
+    """Let this process kill itself when its first demands are in the journal."""
+    append = Journal.append
 
+    def append_and_die(*args: Any) -> None:
+        append(*args)
+        os.kill(os.getpid(), signal.SIGKILL)
 
-def arm(where: str, address: str) -> None:
-    """Let this process kill itself when it reaches a point for the n-th time."""
-    point, _, times = where.partition(":")
-    left = count(int(times or 1) - 1, -1)
-
-    def reach() -> None:
-        if next(left) <= 0:
-            if point == "locked":
-                Path(address, "refs", "heads", "main.lock").touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-            threading.Event().wait()
-
-    if point == "withdrawn":
-        Lanes.withdrawn = staticmethod(reach)  # type: ignore[method-assign]
-        return
-    after, calls = _POINTS.get(point, (False, []))
-
-    def around(known: Any) -> Any:
-        def wrapped(*args: Any, **options: Any) -> Any:
-            if not after:
-                reach()
-            result = known(*args, **options)
-            if after:
-                reach()
-            return result
-
-        return wrapped
-
-    for owner, name in calls:
-        setattr(owner, name, around(getattr(owner, name)))
-
-
-def demand_of(goal: Any) -> Any:
-    """Return a rollback as the demand that the command makes, and any other goal as it is."""
-    is_rollback = isinstance(goal, dict) and goal.get("kind") == "Rollback"
-    return read_journaled(goal) if is_rollback else goal
+    Journal.append = append_and_die  # type: ignore[method-assign]
 
 
 class Lanes:
-    """Clients; one marked ``withdraw`` is withdrawn once a demand of any lane is admitted."""
-
-    @staticmethod
-    def withdrawn() -> None:
-        """Do nothing; for a kill after a withdrawal, :func:`arm` replaces this method."""
-
     def __init__(self, generator: Generator, lanes: list[list[dict[str, Any]]]) -> None:
         self._generator = generator
         self._lanes = [lane for lane in lanes if lane]
         self._left = len(self._lanes)
         self._lock = threading.Lock()
-        self._to_withdraw: list[dict[str, Any]] = []
         self.ended = threading.Event()
         if not self._left:
             self.ended.set()
@@ -236,22 +178,9 @@ class Lanes:
                     self.ended.set()
             return None
         tell(sent=lane[index]["name"])
-        if lane[index].get("withdraw"):
-            self._to_withdraw.append(lane[index])
-        ticket = self._generator.submit(
-            demand_of(lane[index]["goal"]),
-            lane[index]["operation"],
-            lambda stage, text: self._take_back() if stage == "admitted" else None,
-        )
+        ticket = self._generator.submit(lane[index]["goal"], lane[index]["operation"])
         ticket.future.add_done_callback(lambda future: self._answered(lane, index, future))
         return ticket
-
-    def _take_back(self) -> None:
-        while self._to_withdraw:
-            item = self._to_withdraw.pop()
-            if self._generator.withdraw(item["operation"]):
-                tell(withdrawn=item["name"])
-                self.withdrawn()
 
     def _answered(self, lane: list[dict[str, Any]], index: int, future: Future[Receipt]) -> None:
         tell_answer(lane[index]["name"], future)
@@ -268,20 +197,12 @@ def tell_answer(name: str, future: Future[Receipt]) -> None:
 def run(plan: dict[str, Any]) -> None:
     force_writes(plan["synced"])
     agenda.LONGEST_EVALUATION_S = 60.0  # so that no slow machine publishes a batch in two parts
-    arm(plan["die_at"], plan["address"])
+    if plan["dies"]:
+        die_once_journaled()
     generator = Generator(plan["address"])
     tell(ready=os.getpid())
     lanes = Lanes(generator, plan["lanes"])
-    if opening := plan["opening"]:
-        tell(sent=opening["name"])
-        ticket = generator.submit(
-            demand_of(opening["goal"]),
-            opening["operation"],
-            lambda stage, text: lanes.start() if stage == "admitted" else None,
-        )
-        ticket.future.add_done_callback(lambda future: tell_answer(opening["name"], future))
-    else:
-        lanes.start()
+    lanes.start()
     lanes.ended.wait()
     tell(finished=generator.close(PATIENCE_S))
 
@@ -289,14 +210,8 @@ def run(plan: dict[str, Any]) -> None:
 def main() -> None:
     """Import all modules once, and fork for every run; a run prints its events as lines of JSON.
 
-    Each run comes from standard input, as one line of JSON with these fields, among others:
-
-    - ``lanes``: clients, each a list of demands. A client waits for an answer before it sends its
-      next demand.
-    - ``opening``: a demand, or nothing. The lanes start while the worker is busy with this demand,
-      so that the first demands of the lanes become one batch.
-    - ``die_at``: ``<point>`` or ``<point>:<n>``; empty for no kill. The process gets SIGKILL when
-      it reaches the point for the first or the n-th time.
+    Each run comes from standard input, as one line of JSON. Its ``lanes`` are clients, each a list
+    of demands. A client waits for an answer before it sends its next demand.
     """
     logging.basicConfig(level=logging.INFO, stream=sys.stderr)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for ended runs

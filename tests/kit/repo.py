@@ -278,6 +278,17 @@ def away(repo: Path) -> Iterator[None]:
         elsewhere.rename(repo)
 
 
+def lose(repo: Path, spec: str) -> str:
+    """Remove an object from a bare repository, as a disk that fails; return its id."""
+    lost = git(repo, "rev-parse", spec)
+    moved = [path.replace(repo.parent / path.name) for path in repo.glob("objects/pack/*")]
+    for pack in (path for path in moved if path.suffix == ".pack"):
+        with pack.open("rb") as file:
+            subprocess.run(["git", "unpack-objects", "-q"], cwd=repo, stdin=file, check=True)
+    (repo / "objects" / lost[:2] / lost[2:]).unlink()
+    return lost
+
+
 def tip(repo: Path | str) -> str:
     return str(pygit2.Repository(str(repo)).references["refs/heads/main"].target)
 

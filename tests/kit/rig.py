@@ -35,6 +35,7 @@ from tests.kit.repo import (
     git,
     hook,
     init,
+    lose,
     operations,
     root,
     tip,

@@ -99,8 +99,8 @@ def in_reverse(right: Wrong, *given: Any) -> Any:
 # ---- booking ----
 
 
-plant("let_strangers_change_a_demand", 1, permission, "stranger_faults", lambda *_: ())
-plant("release_only_the_first_claim", 34, booking, "claims_of", first_only)
+plant("let_strangers_change_a_demand", 0, permission, "stranger_faults", lambda *_: ())
+plant("release_only_the_first_claim", 43, booking, "claims_of", first_only)
 plant("replace_what_was_joined", 2, Application, "extended", lambda _, app, more: more)
 plant("replace_what_was_joined", 2, Connection, "extended", lambda _, connection, more: more)
 plant("grant_one_claim_too_many", 4, forbidden, "_held", lambda held, *given: held(*given) - 1)
@@ -125,7 +125,7 @@ def let_a_shutdown_end_any_join_of_its_request(shut_down: Any, ledger: Any, aske
     return shut_down(ledger, replace(asked, demanded=tuple(made)))
 
 
-@wrong(1, permission, "stranger_faults")
+@wrong(0, permission, "stranger_faults")
 def take_one_common_requester_for_the_owner(
     faults: Any, request: Any, owners: Any, *more: Any
 ) -> Any:
@@ -133,12 +133,12 @@ def take_one_common_requester_for_the_owner(
     return () if owners & {*request.requesters()} else faults(request, owners, *more)
 
 
-@wrong(0, Claim, "without_topics")
+@wrong(57, Claim, "without_topics")
 def end_the_whole_claim_by_a_shutdown_of_some_topics(_: Any, claim: Any, gone: Any) -> None:
     return None
 
 
-@wrong(5, Lease, "started")
+@wrong(1, Lease, "started")
 def take_back_promised_leases(started: Any, lease: Any, now: Any, before: Any = None) -> Any:
     return started(lease, now)
 
@@ -166,7 +166,7 @@ def count_sources_for_topics(
     return right(scaling, parameters, {topic.source: topic for topic in topics}.values(), *more)
 
 
-plant("share_one_instance", 1, completing, "_separated", itself)
+plant("share_one_instance", 3, completing, "_separated", itself)
 
 
 @wrong(3, completing, "_separated")
@@ -174,7 +174,7 @@ def move_instances_with_the_channel(separated: Any, app: Any, config: Any) -> An
     return replace(separated(app, config), version=app.version)
 
 
-@wrong(127, completing, "_separated")
+@wrong(55, completing, "_separated")
 def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: Any) -> Any:
     made = separated(app, config)
     return made if made.separate else app
@@ -201,7 +201,7 @@ def name_a_shared_route_twice(_: Any, routes: Any) -> Any:
     return tuple(sorted(routes, key=lambda one: one.source))
 
 
-plant("deliver_under_the_source_topic", 3, Route, "written_topic", lambda _, one: one.source)
+plant("deliver_under_the_source_topic", 4, Route, "written_topic", lambda _, one: one.source)
 
 
 @wrong(4, booking, "conflicts")
@@ -222,11 +222,11 @@ plant("leave_the_far_end", 0, ConnectionType, "keys", first_only)
 
 # ---- placement ----
 
-plant("let_the_last_in_first", 11, agenda, "in_turn", in_reverse)
-plant("ignore_priorities", 36, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
+plant("let_the_last_in_first", 52, agenda, "in_turn", in_reverse)
+plant("ignore_priorities", 52, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
 
 
-@wrong(13, decision, "_wait")
+@wrong(3, decision, "_wait")
 def begin_the_wait_anew(
     wait: Any, state: Any, demand: Any, reasons: Any, now: Any, *more: Any
 ) -> Any:
@@ -236,13 +236,13 @@ def begin_the_wait_anew(
 
 plant("forget_those_that_wait", 7, Agenda, "may_have_room", nothing)
 plant("let_others_overtake_in_a_batch", 7, Agenda, "book_those_let_in", nothing)
-plant("leave_drained_nodes_full", 9, agenda, "_to_drain", lambda *_: [])
+plant("leave_drained_nodes_full", 0, agenda, "_to_drain", lambda *_: [])
 plant("place_on_drained_nodes", 12, Choice, "_closed", lambda *_: "")
-plant("choose_anew_for_a_placed_demand", 1, placement, "_booked", nothing)
+plant("choose_anew_for_a_placed_demand", 15, placement, "_booked", nothing)
 plant("count_no_room", 7, forbidden, "excesses", lambda *_: [])
 
 
-@wrong(0, Usage, "plus")
+@wrong(2, Usage, "plus")
 def count_released_room_as_taken(plus: Any, usage: Any, more: Any) -> Any:
     return plus(usage, {need: n for need, n in more.items() if n > 0})
 
@@ -263,27 +263,27 @@ def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any
     return Changeset({**(more or {})}, ())
 
 
-@wrong(16, World, "__post_init__")
+@wrong(151, World, "__post_init__")
 def let_the_lowest_priority_win(right: Any, world: Any) -> None:
     right(world)
     object.__setattr__(world, "overrides", world.overrides[::-1])
 
 
-@wrong(16, overrides, "fits")
+@wrong(0, overrides, "fits")
 def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bool:
     return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
 
 
 plant("run_what_is_denied", 14, planner, "without_suspended", itself)
-plant("book_what_is_denied", 19, forbidden, "denial_faults", lambda *_: ())
+plant("book_what_is_denied", 3, forbidden, "denial_faults", lambda *_: ())
 
 
-@wrong(10, edits, "expired_overrides")
+@wrong(0, edits, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
 
 
-@wrong(10, agenda, "_ends")
+@wrong(0, agenda, "_ends")
 def end_overrides_early_one_by_one(ends: Any, state: Any) -> Any:
     return [(end - timedelta(minutes=2), name) for end, name in ends(state)]
 
@@ -299,7 +299,7 @@ def acknowledge_before_publishing(
     return publish(worker, commits, results, *more)
 
 
-@wrong(1, Worker, "_publish_commits")
+@wrong(4, Worker, "_publish_commits")
 def refuse_before_publishing(
     publish: Any, worker: Any, commits: Any, results: Any, *more: Any
 ) -> bool:
@@ -338,7 +338,7 @@ def decide_on_a_stale_tip(attempt: Any, worker: Any, *given: Any) -> Any:
 plant("drop_what_a_batch_has_left", 0, Demands, "put_back", lambda *given: given[2].clear())
 
 
-@wrong(0, CommitBatch, "follow")
+@wrong(4, CommitBatch, "follow")
 def bring_back_what_was_deleted(follow: Any, batch: Any, followed: Any, now: Any) -> None:
     ledger, files = followed.snapshot.state.ledger, {}
     for claim in followed.before.state.ledger:
@@ -371,13 +371,6 @@ plant("turn_down_what_waits", 1, ProposalBranches, "put", lambda *_: "")
 # ---- answers, withdrawals and stops ----
 
 
-@wrong(0, journal.Journal, "mark_done")
-def note_outcomes_only_in_memory(
-    mark_done: Any, made: Any, operations: Any, *, durably: bool = False
-) -> None:
-    mark_done(made, operations)
-
-
 @wrong(0, Demands, "fail")
 def forget_what_a_stop_leaves(
     fail: Any, made: Any, batch: Any, error: Any, keep: bool = False
@@ -385,13 +378,13 @@ def forget_what_a_stop_leaves(
     fail(made, batch, error)
 
 
-plant("say_that_all_is_withdrawn", 0, Demands, "withdraw", lambda *_: True)
+plant("say_that_all_is_withdrawn", 1, Demands, "withdraw", lambda *_: True)
 
 
 # ---- restart ----
 
 
-plant("forget_the_journal", 3, journal, "read", lambda *_: {})
+plant("forget_the_journal", 0, journal, "read", lambda *_: {})
 
 
 @wrong(17, journal.Journal, "_write")
@@ -399,14 +392,14 @@ def leave_the_journal_in_memory(write: Any, made: Any, records: Any, *, durably:
     write(made, records, durably=False)
 
 
-@wrong(3, journal.Journal, "_rewrite")
+@wrong(0, journal.Journal, "_rewrite")
 def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
     made.pending = dict([*made.pending.items()][-1:])
     rewrite(made)
 
 
 plant(
-    "resume_in_reverse", 51, journal, "read", lambda read, path: dict([*read(path).items()][::-1])
+    "resume_in_reverse", 15, journal, "read", lambda read, path: dict([*read(path).items()][::-1])
 )
 plant("skip_the_search_for_operations", 21, Worker, "_published_before", lambda *_: [])
 
@@ -437,7 +430,7 @@ def _forget_proposal(read: Any, path: Any) -> dict[str, Ticket]:
     return found
 
 
-@wrong(3, permission, "approval")
+@wrong(0, permission, "approval")
 def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> Any:
     return ((), ()) if request.demand in _known else reasons(request, *more)
 

@@ -161,12 +161,6 @@ def imported(name: str, module: str) -> ModuleType:
         ) from None
 
 
-def _hint(word: str) -> str:
-    if meant := next((lead for lead, words in _LEADS.items() if word in words.split()), ""):
-        return f"; did you mean: demandops {meant}"
-    return suggestion(word, [*COMMANDS, *ALIASES]).replace("; known: ", "; the commands are: ")
-
-
 class _LazyGroup(click.Group):
     """A group that lists its commands from ``COMMANDS`` and imports only the command to run."""
 
@@ -174,8 +168,11 @@ class _LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         args = [*ALIASES.get(args[0], args[:1]), *args[1:]]
-        if args[0] not in COMMANDS and not args[0].startswith("-"):
-            ctx.fail(f"there is no command '{args[0]}'{_hint(args[0])}")
+        if (word := args[0]) not in COMMANDS and not word.startswith("-"):
+            hint = suggestion(word, [*COMMANDS, *ALIASES]).replace("known:", "the commands are:")
+            if meant := next((lead for lead, words in _LEADS.items() if word in words.split()), ""):
+                hint = f"; did you mean: demandops {meant}"
+            ctx.fail(f"there is no command '{word}'{hint}")
         name, command, arguments = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
             child_processes.listeners[:] = [show_slow]

@@ -283,8 +283,15 @@ def _listed_inputs(listed: Application, claims: list[Claim]) -> _Listed:
     if claim is None or listed.node not in ("", app.node) or listed.appdef != app.appdef:
         yield "", []
     elif any(listed.inputs.values()):
-        for words, keys in app.listed_topics(listed):
-            yield words, [(claim.key, set(keys))] if keys else []
+        by_name: dict[TopicKey, list[TopicKey]] = {}
+        for key in app.topic_keys():
+            by_name.setdefault(key[:2], []).append(key)
+        for role, topic in listed.all_inputs():
+            named = by_name.get((role, topic.topic), ())
+            # listed without a source, a topic is that of any source
+            keys = {key for key in named if topic.source in ("", key[2])}
+            words = f"{role} {topic.topic} of {topic.source}"
+            yield words, [(claim.key, keys)] if keys else []
     else:
         yield "", [(claim.key, set(app.topic_keys()))]
 

@@ -106,6 +106,13 @@ CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
 FileReader = Callable[[str], str | None]
 
 
+# what a change does to the pods of a release; empty if nothing
+Effect = Literal["starts", "restarts", "reconfigures", "stops", ""]
+
+# values of every chart that do not restart the pods that run
+_ALWAYS_LIVE = frozenset({"replicas", "autoscaler"})
+
+
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
     """A release that starts, changes or stops; ``details`` has a line for each changed fact."""
@@ -115,6 +122,13 @@ class ReleaseChange:
     file: str
     change: Change
     details: tuple[str, ...] = ()
+    effect: Effect = ""
+
+    @property
+    def title(self) -> str:
+        # a sign before it says what starts and what stops
+        effect = f", {self.effect}" if self.change == "change" and self.effect else ""
+        return f"{self.name} ({self.what}){effect}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +229,7 @@ def render_change(
         if text is not None and text == current:
             continue
         if old or new:
-            releases.append(describe_change(old, new, current is not None))
+            releases.append(describe_change(old, new, current, text))
     _refuse_large(files, config.repo_settings.limits.file_bytes, read)
     releases.sort(key=lambda each: (CHANGE_ORDER.index(each.change), each.name))
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked))
@@ -237,10 +251,13 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
         raise Refused(faults)
 
 
-def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
-    """Return how a release changes; ``existed`` says that it had a file before."""
+def describe_change(
+    old: Release | None, new: Release | None, current: str | None, text: str | None
+) -> ReleaseChange:
+    """Return how a release changes, and with it its file, from the text ``current`` to ``text``."""
     release = new or old
     assert release is not None  # noqa: S101 - a change has at least one side
+    existed = current is not None
     kind: Change = "stop" if not new else "change" if existed else "start"
     details: list[str] = []
     if new and existed:
@@ -256,7 +273,28 @@ def describe_change(old: Release | None, new: Release | None, existed: bool) -> 
         old_facts, new_facts = frozenset(before), frozenset(after)
         details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
         details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
-    return ReleaseChange(release.name, release.description, path_of(release), kind, tuple(details))
+    effect = _effect(old, new, current, text)
+    return ReleaseChange(
+        release.name, release.description, path_of(release), kind, tuple(details), effect
+    )
+
+
+def _effect(
+    old: Release | None, new: Release | None, current: str | None, text: str | None
+) -> Effect:
+    if text is None or current is None:
+        return "stops" if text is None else "starts"
+    had, has = (getattr(side, "replicas", None) != 0 for side in (old, new))
+    if had is not has:
+        return "starts" if has else "stops"
+    (was, before), (now, after) = map(gitops.values_apart, (current, text))
+    if before != after:
+        return "restarts"
+    if was == now:  # only comments differ, which name overrides
+        return ""
+    live = {*new.service.live, *_ALWAYS_LIVE} if isinstance(new, ServiceRelease) else set()
+    differing = {name for name in {**was, **now} if was.get(name, ABSENT) != now.get(name, ABSENT)}
+    return "reconfigures" if differing <= live else "restarts"
 
 
 # ---- all generated files of a state ----
@@ -452,7 +490,7 @@ def described(
     before: Release | None, after: Release | None, text: str | None, new_text: str | None
 ) -> ReleaseChange:
     """Return how a release changes, by its plans and its texts before and after."""
-    change = describe_change(before, after, text is not None)
+    change = describe_change(before, after, text, new_text)
     if change.change != "change":
         return change
     paths = [path_of(side) for side in (before, after) if side]

@@ -99,6 +99,20 @@ def release_text(release: Release, config: Config, evaluate: Evaluate, current: 
     return "".join(f"{comment}\n" for comment in comments) + body
 
 
+_VALUES = re.compile(r"(?m)^( +)values(?:Object)?:\n((?:\1 +.*\n|\n)+)")
+
+
+def values_apart(text: str) -> tuple[dict[str, str], str]:
+    """Return the texts of a release's Helm values by name, and its manifests without them."""
+    # Parsing would take longer than all else about a demand, and the text is one that `render` made
+    manifests = "".join(line for line in text.splitlines(True) if not line.startswith(_START))
+    if (match := _VALUES.search(manifests)) is None:
+        return {}, manifests
+    parts = re.split(rf"(?m)^{match[1]}  (?=\S)", match[2])[1:]
+    values = {name: value for name, _, value in (part.partition(":") for part in parts)}
+    return values, manifests[: match.start(2)] + manifests[match.end(2) :]
+
+
 def render(release: Release, config: Config, evaluate: Evaluate) -> str:
     """Return the manifests of a release as text; raise Refused or InvalidInput if not possible.
 

@@ -335,7 +335,8 @@ def claim_item(source: Source, claim: Claim, state: str) -> Json:
     way = f"send request '{claim.request}' again with shutdown: true"
     if claim.keeping_override is not None:
         way = f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
-    elif is_released_by_demand_id(claim):
+    # a goal of the reference's action has no demand id: the generator derives it from the request
+    elif claim.demand != demand_id(claim.request, claim.requesters):
         way = f"send 'operation: release' for demand '{claim.demand}'"
     return {
         "name": data["file"],
@@ -345,12 +346,6 @@ def claim_item(source: Source, claim: Claim, state: str) -> Json:
         "kept_by": vocabulary.override_data(kept, ("keep",)) if kept else None,
         "suspended_by": vocabulary.override_data(denying, ("deny",)) if denying else None,
     }
-
-
-def is_released_by_demand_id(claim: Claim) -> bool:
-    # A goal of the reference's action has no demand id. The generator derives it from the request.
-    is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
-    return claim.keeping_override is None and not is_of_a_request
 
 
 def _suspending(item: Json, now: datetime) -> list[str]:

@@ -507,8 +507,8 @@ def last_difference(source: Source, answer: Json) -> list[Json]:
 # ---- what would follow ----
 
 
-def release_of(source: Source, demand: str) -> tuple[Json, Decision | None, str]:
-    """Return the goal that releases a demand, and what would follow, or why it would be refused."""
+def release_of(source: Source, demand: str) -> tuple[Decision | None, str]:
+    """Return what would follow from the release of a demand, or why it would be refused."""
     goal = {
         "apiVersion": API_VERSION,
         "kind": "Demand",
@@ -518,9 +518,9 @@ def release_of(source: Source, demand: str) -> tuple[Json, Decision | None, str]
     }
     try:
         read = source.reader().file_reader(source.commit)
-        return goal, decide(source.state, goal, source.now, read), ""
+        return decide(source.state, goal, source.now, read), ""
     except InvalidInput as error:
-        return goal, None, str(error)
+        return None, str(error)
 
 
 def stopped_with(source: Source, name: str) -> list[str]:

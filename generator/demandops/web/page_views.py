@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -12,11 +13,10 @@ from urllib.parse import urlencode
 
 from starlette.requests import Request
 
-from demandops.base import strict_yaml
 from demandops.model.config.base_model import parse_time
 from demandops.model.release import ServiceRelease
 from demandops.views import causes as cause_list
-from demandops.views.kinds import KINDS, Kind, is_released_by_demand_id, rows_of
+from demandops.views.kinds import KINDS, Kind, rows_of
 from demandops.views.rows import RANKS, TONES, Filter, Row, exactly, page_of, sorted_rows
 from demandops.views.source import Source
 from demandops.views.vocabulary import Json
@@ -293,31 +293,18 @@ def thing(source: Source, name: str, kind: str, health: Iterable[Event]) -> Data
         "text": answer["file"] and source.reader().file_reader(source.commit)(answer["file"]),
         "released": None,
         "stopped_with": [],
-        "denial": "",
+        "stop": "",
     }
     if kind == "demand" and answer["claims"]:
-        goal, released, refused = release_of(source, name)
-        by_id = is_released_by_demand_id(source.claims_of_demands[name][0])
-        goal_text = strict_yaml.dump(goal) if by_id else ""
-        data |= {"released": released, "refused": refused, "goal": goal_text}
+        data["released"], data["refused"] = release_of(source, name)
     if runs:
         release = source.releases[name]
         if isinstance(release, ServiceRelease):
-            selector = {"services": [release.key.service], "nodes": [release.node.id]}
+            selection = ["--service", release.key.service, "--node", release.node.id]
         else:
-            selector = {"connections": list(release.connections)}
+            selection = [word for id in release.connections for word in ("--connection", id)]
         data["stopped_with"] = stopped_with(source, name)
-        data["denial"] = strict_yaml.dump(
-            {
-                "apiVersion": "demandops/v1",
-                "kind": "Override",
-                "select": [selector],
-                "deny": True,
-                "owner": "your name or team",
-                "reason": "why",
-                "expires": f"{source.now:%Y-%m-%d}T23:59:59Z",
-            }
-        )
+        data["stop"] = shlex.join(["demandops", "suspend", *selection, "-m", "REASON"])
     return data
 
 

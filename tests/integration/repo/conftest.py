@@ -1,4 +1,4 @@
-"""Fixtures: a clock, a Git server with faults, and a person named Petra."""
+"""Fixtures: a clock, Git servers with faults, and a person named Petra."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +9,17 @@ from demandops.serve import agenda
 from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server, serving
 from tests.kit.repo import Person
+
+SSH = """#!/bin/bash
+for last; do :; done
+case $last in
+  git-receive-pack*)
+    [ ! -e "$0.push" ] || sleep 1000
+    [ -z "$SAYS" ] || [ -e "$0.open" ] || { printf '%b\\n' "$SAYS" >&2; exit 1; } ;;
+  *) [ ! -e "$0.fetch" ] || sleep 1000 ;;
+esac
+exec sh -c "$last"
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -45,3 +56,18 @@ def petra(person: Person, monkeypatch: pytest.MonkeyPatch) -> Person:
     monkeypatch.setattr(agenda, "CHECK_REMOTE_S", 0.1)
     person.policy(approval="required")
     return person
+
+
+@pytest.fixture
+def ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A program in the place of ssh; files beside it set its faults.
+
+    While `ssh.push` or `ssh.fetch` exists, it is silent at pushes or fetches. With the variable
+    SAYS, it refuses pushes with these words, unless `ssh.open` exists.
+    """
+    program = tmp_path / "ssh"
+    program.write_text(SSH)
+    program.chmod(0o755)
+    monkeypatch.setenv("GIT_SSH_COMMAND", str(program))
+    monkeypatch.setenv("GIT_SSH_VARIANT", "ssh")
+    return program

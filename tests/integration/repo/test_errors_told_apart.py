@@ -263,29 +263,6 @@ def test_a_clone_that_cannot_be_read_meanwhile_is_named_and_waited_for(
     rig.assert_sound(bare)
 
 
-def lose(repo: Path, tmp_path: Path, spec: str) -> str:
-    """Remove an object from a bare repository; return its id."""
-    lost = rig.git(repo, "rev-parse", spec).strip()
-    moved = [path.replace(tmp_path / path.name) for path in repo.glob("objects/pack/*")]
-    for pack in (path for path in moved if path.suffix == ".pack"):
-        with pack.open("rb") as file:
-            subprocess.run(["git", "unpack-objects", "-q"], cwd=repo, stdin=file, check=True)
-    (repo / "objects" / lost[:2] / lost[2:]).unlink()
-    return lost
-
-
-@pytest.mark.parametrize("path", ["demandops.yaml", "inventory", "registry/images.yaml"])
-def test_a_repo_of_this_disk_that_lost_a_file_is_told_with_the_remedy(
-    bare: Path, tmp_path: Path, demandops: Run, path: str
-) -> None:
-    lost = lose(bare, tmp_path, f"main:{path}")
-    with pytest.raises(StateRepoError, match=f"{lost}.*restore them from a backup"):
-        Generator(str(bare))
-    told = demandops("bookkeeping", "--state-repo", bare)
-    assert told.code == 1
-    assert f"{path} of commit {tip(bare)[:10]}, Git object {lost}" in told.err
-
-
 def test_a_file_that_the_state_in_effect_had_and_git_lost_is_told(
     bare: Path, tmp_path: Path, person: Person
 ) -> None:
@@ -293,7 +270,7 @@ def test_a_file_that_the_state_in_effect_had_and_git_lost_is_told(
     with rig.running(bare) as generator:  # it reads the last valid version of a file by its id
         person.change({IMAGES: "kind: [\n"})
         rig.book(generator, goal(1))
-    lost = lose(bare, tmp_path, f"{valid}:{IMAGES}")
+    lost = rig.lose(bare, f"{valid}:{IMAGES}")
     command = [sys.executable, "-m", "demandops.cli.main", "bookkeeping", "--state-repo", str(bare)]
     told = subprocess.run(command, capture_output=True, text=True, check=False)  # without caches
     assert told.returncode == 1, told.stderr
@@ -306,7 +283,7 @@ def test_a_checkout_that_lacks_a_file_is_told_by_check(
 ) -> None:
     folder = tmp_path / "checkout"
     rig.git(tmp_path, "clone", "--quiet", "--no-local", str(bare), str(folder))
-    lost = lose(folder / ".git", tmp_path, "HEAD:demandops.yaml")
+    lost = rig.lose(folder / ".git", "HEAD:demandops.yaml")
     with (folder / "demandops.yaml").open("a") as file:
         file.write("# git would store the lost content again\n")
     told = demandops("check", folder)
@@ -347,33 +324,3 @@ def test_a_remote_that_does_not_answer_is_told(url: str, tmp_path: Path) -> None
         result = repository._run_git("ls-remote", place, timeout=0.2)
     message = str(repository.push_error(result, MAIN))
     assert message.startswith(f"{url} cannot be pushed to: fatal: git timed out after 0.2 s; check")
-
-
-def _lose_the_fusion(repo: Path) -> str:
-    """Remove the rendered file of the fusion that goal 1 has started; return its path."""
-    (path,) = [each for each in git(repo, "ls-tree", "-r", "--name-only", "main").split()
-               if "/of-" in each]  # fmt: skip
-    lose(repo, repo.parent, f"main:{path}")
-    return path
-
-
-def test_a_damaged_file_fails_only_demands_that_read_it_and_is_named(bare: Path) -> None:
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-    path = _lose_the_fusion(bare)
-    with rig.running(bare) as generator:
-        reads, other = generator.submit(goal(6)), generator.submit(goal(2))  # 6 has the fusion of 1
-        with pytest.raises(StateRepoError, match=f"{path} of commit .* is missing or damaged"):
-            rig.receipt(reads)
-        assert rig.receipt(other).outcome == "booked"
-
-
-def test_a_file_that_only_a_clone_has_lost_is_fetched_again(url: str, bare: Path) -> None:
-    with rig.running(url) as generator:
-        rig.book(generator, goal(1))
-        clone = generator._slot.folder / "clone.git"
-    git(clone, "branch", "main", "refs/remotes/origin/main")
-    _lose_the_fusion(clone)
-    with rig.running(url) as generator:
-        rig.book(generator, goal(6))  # has the fusion of goal 1
-    rig.assert_sound(bare)

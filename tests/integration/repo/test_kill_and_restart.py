@@ -85,6 +85,39 @@ def _note(told: Told, sent: list[str], acknowledged: dict[str, str]) -> None:
         acknowledged[name] = answer["commit"]
 
 
+# ---- what was released stays released ----
+
+
+@pytest.mark.parametrize("node", ["edge", "cloud"])
+def test_what_was_answered_without_a_commit_is_not_booked_after_a_power_loss(
+    bare: Path, data_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, node: str
+) -> None:
+    """``again`` changes nothing if its node is ``edge``, and is refused if it is ``cloud``.
+
+    If ``again`` were decided once more after the release, it would be booked.
+    """
+    synced, again = {}, goal(1)
+    again["apps"][0]["header"]["node_id"] = node
+
+    def sync(handle: int) -> None:
+        path = Path(f"/proc/self/fd/{handle}").readlink()
+        synced[path] = path.read_bytes()
+
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        monkeypatch.setattr(os, "fdatasync", sync)
+        ticket = generator.submit(again)
+        assert (ticket.future.exception(rig.PATIENCE_S) is None) == (node == "edge")
+        left = dict(synced)
+    with rig.running(bare, data=tmp_path / "another-machine") as other:
+        rig.book(other, rig.leave(1))
+    (journal,) = data_home.glob("*/slot-0/outbox.jsonl")
+    journal.write_bytes(left[journal])
+
+    assert rig.restart(bare) is True
+    assert rig.claims(bare) == []
+
+
 # ---- what a kill leaves lying about ----
 
 
@@ -199,7 +232,7 @@ def test_two_processes_have_slots_of_their_own_and_a_dead_ones_journal_is_adopte
 ) -> None:
     with rig.running(url) as first:
         # a second process is killed beside the first, with a demand in its journal
-        told = drivers.start(url, [[demand("join-1", goal(1))]], die_at="journaled").listen()
+        told = drivers.start(url, [[demand("join-1", goal(1))]], dies=True).listen()
         assert told.finished is None
         slots = sorted(path.name for path in next(data_home.iterdir()).iterdir())
         assert slots == ["slot-0", "slot-1"]
@@ -221,7 +254,7 @@ def test_the_journal_of_one_state_repo_is_never_played_into_another(
     for folder in (here, there):
         folder.mkdir()
         new_repo(f"{folder.name}/state.git")
-    drivers.start("state.git", [[demand("join-1", goal(1))]], cwd=here, die_at="journaled").listen()
+    drivers.start("state.git", [[demand("join-1", goal(1))]], cwd=here, dies=True).listen()
     assert rig.restart(there / "state.git") is True
     assert rig.operations(there / "state.git") == []
     # the journal is found again however the folder is named

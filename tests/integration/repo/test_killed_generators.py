@@ -30,14 +30,6 @@ print("ready", flush=True)
 generator.submit(json.loads(sys.stdin.readline()), "op-hanging")
 threading.Event().wait()
 """
-SSH = """#!/bin/sh
-for command; do :; done
-case $command in
-  *receive-pack*) [ ! -e "$0.push" ] || sleep 1000 ;;
-  *) [ ! -e "$0.fetch" ] || sleep 1000 ;;
-esac
-exec sh -c "$command"
-"""
 
 
 def _stat(pid: int) -> list[str]:
@@ -110,16 +102,6 @@ def test_a_push_over_http_ends_with_its_generator(http: str, server: Server, bar
         assert rig.operations(bare) == ["op-hanging"]
     finally:
         silence.set()
-
-
-@pytest.fixture
-def ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    program = tmp_path / "ssh"
-    program.write_text(SSH)
-    program.chmod(0o755)
-    monkeypatch.setenv("GIT_SSH_COMMAND", str(program))
-    monkeypatch.setenv("GIT_SSH_VARIANT", "ssh")
-    return program
 
 
 def test_a_push_over_ssh_ends_with_its_generator(bare: Path, ssh: Path) -> None:

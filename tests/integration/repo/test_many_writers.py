@@ -1,14 +1,12 @@
 """Several writers at one state repo at once: no demand is lost or counts twice.
 
-The load is small in the gate; `make load` sends 2,000 demands and prints the figures of each
-writer.
+The load is small in the gate; `make load` sends 2,000 demands and prints figures.
 """
 
 from __future__ import annotations
 
 import os
 import random
-import statistics
 import subprocess
 import threading
 import time
@@ -128,10 +126,7 @@ def test_many_writers_end_where_one_would(
         people.join(rig.PATIENCE_S)
     with capsys.disabled():
         print(f"\n{DEMANDS} demands in {took:.1f} s, {server.cut} cuts")
-        for who, one in enumerate(told):
-            waits = statistics.median(one.waits.values()), max(one.waits.values())
-            print(f"  generator {who}: median {waits[0]:.2f} s, longest {waits[1]:.2f} s")
-        print(f"  person: {len(person.pushed)} pushed, most tries {max(person.tries)}")
+        print(f"a person pushed {len(person.pushed)} times, with up to {max(person.tries)} tries")
     assert_one_would_have_done_the_same(bare, sent, told, person.pushed)
     assert server.cut, "no connection was cut, so the test has tested nothing"
 

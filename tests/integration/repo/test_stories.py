@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.base.errors import StateRepoError
 from demandops.base.naming import Subject, SubjectKind
 from demandops.decide.state import rendered_files
 from demandops.model.demand import goals as demand_goals
@@ -396,6 +397,18 @@ class Story:
                 file.mkdir() if text is not None else file.rmdir()
             else:
                 file.write_text(text) if text is not None else file.unlink()
+
+    def loses(self, spec: str) -> None:
+        """Let the disk of the state repo lose an object."""
+        rig.lose(self._bare, spec)
+
+    def clone_loses(self, path: str) -> None:
+        """Let the disk of the clone of `remote`, which is stopped, lose a file of main."""
+        rig.lose(self._data / "remote/slot-0/clone.git", f"refs/remotes/origin/main:{path}")
+
+    def cannot_start(self, why: str) -> None:
+        with pytest.raises(StateRepoError, match=why):
+            Generator(str(self._bare))
 
     def http(self, faults: Mapping[str, Any]) -> None:
         """Set faults of the smart-HTTP server."""

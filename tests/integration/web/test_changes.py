@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from demandops.cli.main import run
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.views.kinds import rows_of
@@ -27,19 +29,26 @@ from tests.integration.web.html import Page
 from tests.kit import goals
 from tests.kit.config import override
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import GitRepo, Person, away, git
-from tests.kit.rig import Proposed, book, running, wait_until
+from tests.kit.repo import GitRepo, Person, away
+from tests.kit.rig import book, running, wait_until
 
 LINK = {"id": "vehicle02/cloud", "type": "mqtt", "source": "vehicle02", "target": "cloud"}
 LINK |= {"topics": [{"source": "/t"}]}
 DETECTION = "od-edge-vehicle00"
 
 
-def overridden(generator: Generator, overrides: int = 1) -> None:
-    """Wait until the generator follows a person's overrides."""
+def overridden(generator: Generator) -> None:
+    """Wait until the generator follows a person's override."""
     generator.fetch_now()
-    wait_until(
-        lambda: len(generator.snapshot.state.config.overrides) == overrides, "overrides apply"
+    wait_until(lambda: generator.snapshot.state.config.overrides, "it applies")
+
+
+def typed(page: Page, state: GitRepo) -> None:
+    """Run the command that a page shows, in earnest."""
+    (command,) = [e.text for e in page.all("pre") if e.text.strip().startswith("demandops ")]
+    _, *args = shlex.split(command.removesuffix(" --dry-run"))
+    assert (
+        command.endswith(" --dry-run") and run([*args, "-y", "--state-repo", str(state.path)]) == 0
     )
 
 
@@ -135,27 +144,6 @@ def test_an_invalid_file_names_who_wrote_it_and_too_many_causes_are_counted(
     assert page.texts("h1") == ["2 things need attention"]
 
 
-def test_a_proposal_names_its_commit_and_how_to_approve_just_that(
-    booked: Generator, state: GitRepo, person: Person, look: Look, follower: Follower
-) -> None:
-    person.policy(approval="required")
-    booked.fetch_now()
-    wait_until(lambda: not _approved(booked), "demands need approval")
-    proposed = Proposed(booked, goals.goal([goals.application("edge/new", who=["v"])], []))
-    branch = proposed.branch
-    wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
-    commit = git(state.path, "rev-parse", branch)
-    approve = f"demandops approve {branch} --commit {commit}"
-    assert approve in look("/").text
-    shown = look("/proposals").text
-    assert commit in shown and approve in shown
-    assert approve.replace("approve", "reject") in shown
-
-
-def _approved(generator: Generator) -> bool:
-    return generator.snapshot.state.config.domains["perception"].approval == "none"
-
-
 def test_a_lease_is_listed_and_the_consequence_of_its_release_is_what_follows(
     booked: Generator, look: Look, state: GitRepo
 ) -> None:
@@ -164,9 +152,10 @@ def test_a_lease_is_listed_and_the_consequence_of_its_release_is_what_follows(
     assert re.match(r"mine in [0-9m]+s? vehicle02 10m vehicle02/cloud", row)
     page = look("/demand", id="mine")
     told = {e.text.strip() for e in page.all("a") if "li" in e.inside and "main" in e.inside}
-    (command,) = [e.text for e in page.all("pre")]
     before = set(state.manifests())
-    book(booked, yaml.safe_load(command.partition("<<'END'\n")[2].removesuffix("END")))
+    typed(page, state)
+    booked.fetch_now()
+    wait_until(lambda: str(booked.snapshot.commit) == state.tip, "the generator knows")
     gone = {Path(path).stem for path in before - set(state.manifests())}
     assert gone == told and len(gone) == 2
 
@@ -178,48 +167,21 @@ def test_a_lease_is_listed_and_the_consequence_of_its_release_is_what_follows(
         ("mqtt-vehicle00-edge-source-d3ca91c2df6c", "vehicle00/edge is booked, but {} denies it"),
     ],
 )
-def test_the_file_that_stops_a_release_stops_it(
-    booked: Generator, person: Person, look: Look, state: GitRepo, release: str, told: str
+def test_the_command_that_stops_a_release_stops_it(
+    booked: Generator, look: Look, state: GitRepo, release: str, told: str
 ) -> None:
     page = look("/release", name=release)
-    (text,) = [e.text for e in page.all("pre") if "kind: Override" in e.text]
-    (promise,) = [text for text in page.texts("p") if "This file would stop it" in text]
+    (promise,) = [text for text in page.texts("p") if "That stops it" in text]
     before = set(state.manifests())
-    name = text.splitlines()[0].removeprefix("# ")
-    person.change({name: text})
+    typed(page, state)
     overridden(booked)
     assert look("/release", name=release).texts("h1") != [f"Release {release} unknown"]
+    (name,) = state.files("overrides/suspend-")
     assert told.format(name) in look("/").text
     gone = {Path(path).stem for path in before - set(state.manifests())}
     assert release in gone
     named = {word for word in re.split(r"[ ,.]+", promise) if word.startswith(("od-", "mqtt-"))}
     assert named == gone - {release}
-
-
-def test_an_override_that_another_holds_back_is_told(
-    booked: Generator, person: Person, look: Look
-) -> None:
-    fusion = {"services": ["object-fusion"]}
-    person.override(
-        frozen=override(fusion, hold=True, priority=1), more=override(fusion, replicas=2)
-    )
-    overridden(booked, 2)
-    assert "held back" in look("/overrides").text
-
-
-def test_a_span_of_the_time_line_lists_only_its_events(booked: Generator, look: Look) -> None:
-    def commits(page: Page) -> list[str]:
-        return [text.split()[-1] for text in page.texts("tr")[1:]]
-
-    everything = look("/timeline", span="all")
-    assert len(commits(everything)) == 3 and "Create the state repo" in everything.text  # long ago
-    page = look("/timeline", span="15min")
-    assert commits(page) == commits(everything)[:2]
-    assert "2 events in the last 15min" in page.text
-    dots = [title for title in page.texts("title") if " UTC, " in title]
-    more = [int(count) for title in dots for count in re.findall(r"and (\d+) more", title)]
-    assert len(dots) + sum(more) == 2  # the drawing has the same events as the list
-    assert len(commits(look("/timeline", span="7d", q="who:vehicle01"))) == 1
 
 
 def test_the_command_serves_the_page_until_it_is_stopped(bare: Path) -> None:

@@ -24,6 +24,7 @@ from demandops.web.page_views import thing
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes
+from tests.integration.web.html import Page
 from tests.kit.goals import put
 from tests.kit.repo import GitRepo
 
@@ -291,6 +292,21 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     rows = [row for row in rows_of(now, "demands") if Filter("demand=later").matches(row)]
     assert [row.item["state"] for row in rows] == ["waiting"]
     assert thing(now, "later", "demand", ())["word"] == "waiting"
+
+
+def test_a_span_of_the_time_line_lists_only_its_events(look: Look) -> None:
+    def commits(page: Page) -> list[str]:
+        return [text.split()[-1] for text in page.texts("tr")[1:]]
+
+    everything = look("/timeline", span="all")
+    assert len(commits(everything)) == 3 and "Create the state repo" in everything.text  # long ago
+    page = look("/timeline", span="15min")
+    assert commits(page) == commits(everything)[:2]
+    assert "2 events in the last 15min" in page.text
+    dots = [title for title in page.texts("title") if " UTC, " in title]
+    more = [int(count) for title in dots for count in re.findall(r"and (\d+) more", title)]
+    assert len(dots) + sum(more) == 2  # the drawing has the same events as the list
+    assert len(commits(look("/timeline", span="7d", q="who:vehicle01"))) == 1
 
 
 def test_the_time_line_fills_the_drawing(shown: Shown) -> None:

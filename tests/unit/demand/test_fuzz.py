@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
-from tests.kit.goals import APP, CLOUD, application, connection, goal
+from tests.kit.goals import APP, CLOUD
 from tests.kit.memory import NOW, MemoryRepo
 
 TEXT = st.text(max_size=12) | st.sampled_from(
@@ -67,34 +67,6 @@ def test_whatever_comes_is_refused_with_a_reason(data: Any) -> None:
     found = outcome(data)
     assert isinstance(found, tuple), "no value made up here can be a demand"
     assert_told(found)
-
-
-TEXTS = st.lists(TEXT, max_size=2)
-TOPICS = st.lists(st.tuples(TEXT, TEXT), max_size=2)
-TYPE = st.integers(0, 3)
-APPLICATIONS = st.builds(
-    application, TEXT, node=TEXT, who=TEXTS, ego=TOPICS, clouds=TOPICS, type=TYPE
-)
-CONNECTIONS = st.builds(
-    connection, TEXT, who=TEXTS, ends=st.tuples(TEXT, TEXT), topics=TEXTS, targets=TEXTS,
-    broker=TEXT, type=TYPE,
-)  # fmt: skip
-GOALS: st.SearchStrategy[Any] = st.builds(
-    goal,
-    st.lists(APPLICATIONS, max_size=2),
-    st.lists(CONNECTIONS, max_size=2),
-    id=TEXT,
-    shutdown=st.booleans(),
-)
-
-
-@examples(70)
-@example(goal([], [connection(ends=("\x7f", "\x7f"), topics=["/a"])]))
-@given(GOALS)
-def test_a_goal_of_the_right_form_is_decided_or_refused(data: Any) -> None:
-    found = outcome(data)
-    if isinstance(found, tuple):
-        assert_told(found)
 
 
 def test_a_name_with_half_a_character_is_refused_wherever_it_stands() -> None:

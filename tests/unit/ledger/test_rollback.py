@@ -64,45 +64,31 @@ def test_books_and_files_are_what_they_were(seed: int) -> None:
     assert decision.outcome == ("restored" if decision.files else "unchanged")
 
 
-def test_a_rollback_past_newer_claims_is_refused_and_lists_them() -> None:
+def test_a_rollback_past_newer_or_changed_claims_is_refused_and_lists_them() -> None:
     repo = filled(0)
     *kept, newer = repo.state.ledger
     found = refusal(repo, back_to(kept))
     assert [(one.code, one.field) for one in found] == [("newer", ""), ("newer", "")]
-    who = ", ".join(newer.requesters)
+    who, when = ", ".join(newer.requesters), f"{newer.booked:%Y-%m-%d %H:%M:%S} UTC"
     assert found[0].message == (
-        f"would drop the claim of {who} on {newer.subject}, booked "
-        f"{newer.booked:%Y-%m-%d %H:%M:%S} UTC (request '{newer.request}')"
+        f"would drop the claim of {who} on {newer.subject}, booked {when} "
+        f"(request '{newer.request}')"
     )
     assert "--drop-newer" in found[1].message
-
-
-def test_a_claim_changed_since_counts_as_newer() -> None:
-    repo = filled(0)
-    first, *others = repo.state.ledger
-    found = refusal(repo, back_to([replace(first, request="another"), *others]))
+    found = refusal(repo, back_to([*kept, replace(newer, request="another")]))
     assert "would undo a change of the claim of" in found[0].message
 
 
-def test_a_claim_that_comes_back_has_its_lease_from_now_on() -> None:
+def test_a_lease_counts_anew_if_its_claim_comes_back_and_stays_if_it_was_renewed_since() -> None:
     repo = filled(0)
     first, *others = repo.state.ledger
-    leased = replace(first, lease=LEASE)
+    request = back_to([replace(first, lease=LEASE), *others])
     without = with_ledger(repo, repo.state.ledger.replace(first.key, None))
-    decision = rolled_back(repo, back_to([leased, *others]), without)
-    until = LATER + timedelta(minutes=10)
-    assert decision.state.ledger.get(first.key) == replace(
-        leased, lease=replace(LEASE, until=until)
-    )
-
-
-def test_a_lease_renewed_since_stays_as_it_is() -> None:
-    repo = filled(0)
-    first, *others = repo.state.ledger
-    until = NOW + timedelta(minutes=50)
-    renewed = replace(first, lease=replace(LEASE, until=until))
+    anew = replace(first, lease=replace(LEASE, until=LATER + timedelta(minutes=10)))
+    assert rolled_back(repo, request, without).state.ledger.get(first.key) == anew
+    renewed = replace(first, lease=replace(LEASE, until=NOW + timedelta(minutes=50)))
     state = with_ledger(repo, repo.state.ledger.replace(first.key, renewed))
-    decision = rolled_back(repo, back_to([replace(first, lease=LEASE), *others]), state)
+    decision = rolled_back(repo, request, state)
     assert (decision.outcome, dict(decision.files)) == ("unchanged", {})
 
 

@@ -14,7 +14,7 @@ from demandops.model.demand.demand import Decommission
 from demandops.repo.history import commit_message
 
 from tests.kit import goals
-from tests.unit.decide.test_waiting import put, release, waiting_repo
+from tests.unit.decide.test_room import put, release, waiting_repo
 from tests.unit.repo.conftest import NOW, Desk
 
 FILE = Path(__file__).with_name("commit-messages.txt")

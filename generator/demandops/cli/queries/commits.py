@@ -182,7 +182,7 @@ def in_effect(repo: Reader, snapshot: Snapshot) -> str:
 
 def release_lines(releases: Iterable[ReleaseChange], word: str = "") -> Iterator[str]:
     for release in releases:
-        yield f"{SIGNS[release.change]} {word}{release.name} ({release.what})"
+        yield f"{SIGNS[release.change]} {word}{release.title}"
         yield from (f"    {detail}" for detail in release.details)
 
 

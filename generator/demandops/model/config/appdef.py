@@ -205,6 +205,8 @@ class Deployed(CamelModel):
     place: Place | None = None
     scaling: Scaling = Scaling()
     requests: Resources = Field(default_factory=dict)
+    # The values at the top level that the running service takes over, so that its pods stay
+    live: Items[Text] = ()
     chart: DnsLabel
     images: Items[DnsLabel] = ()
     values: Annotated[str, StringConstraints(pattern=r"^values/[A-Za-z0-9_.-]+$")]

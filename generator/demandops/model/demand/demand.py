@@ -291,17 +291,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         if not any(self.inputs.values()):
             yield ()
 
-    def listed_topics(self, listed: Application) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield (text, matching keys of this application) for each input that a shutdown lists."""
-        by_name: dict[TopicKey, list[TopicKey]] = {}
-        for key in self.topic_keys():
-            by_name.setdefault(key[:2], []).append(key)
-        for role, topic in listed.all_inputs():
-            named = by_name.get((role, topic.topic), [])
-            # listed without a source, a topic is that of any source
-            keys = [key for key in named if topic.source in ("", key[2])]
-            yield f"{role} {topic.topic} of {topic.source}", keys
-
     def without_topics(self, gone: Container[TopicKey]) -> Application | None:
         left = {
             role: tuple(t for t in topics if (role, t.topic, t.source) not in gone)

@@ -368,6 +368,6 @@ def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
         ]
     lines = ["Desired state:"]
     for release in releases:
-        lines.append(f"  {_SIGNS[release.change]} {release.name} ({release.what})")
+        lines.append(f"  {_SIGNS[release.change]} {release.title}")
         lines += [f"      {detail}" for detail in release.details]
     return lines

@@ -1,4 +1,4 @@
-"""The Role and the AppProject permit the same kinds of objects in an access domain."""
+"""What an access domain keeps apart: the kinds of its objects, and the credentials of brokers."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from demandops.model.config.load import load
 
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
+from tests.unit.model.test_config_mistakes import changed
 
-DOMAINS = "policy/access-domains.yaml"
+DOMAINS, BROKERS = "policy/access-domains.yaml", "inventory/brokers.yaml"
 MONITOR = "{kind: ServiceMonitor, group: monitoring.coreos.com, resource: servicemonitors}"
 REGISTERED = {
     "": "ConfigMap PersistentVolumeClaim Secret Service ServiceAccount",
@@ -94,3 +95,42 @@ def test_the_list_of_the_documentation_is_taken() -> None:
     files = edited(DOMAINS, '    nodes: ["*"]\n', f'    nodes: ["*"]\n{listed[0]}')
     assert ("monitoring.coreos.com", "ServiceMonitor") in permitted(files)
     assert len(permitted(files)) == 4
+
+
+# ---- credentials of brokers ----
+
+
+def secrets(files: dict[str, Any]) -> dict[str, list[tuple[str, list[str]]]]:
+    """Return the secrets and keys that the clients of a connection between two domains get."""
+    books = MemoryRepo(changed({"base": "two domains"} | files))
+    link = {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
+    books.send({"kind": "Demand", "demand": "d", "requesters": ["v"], "connections": [link]})
+    pods = [item["spec"]["template"]["spec"] for item in books.objects("Deployment").values()]
+    return {
+        pod["nodeSelector"]["node_id"]: [
+            (one["secret"]["secretName"], [item["key"] for item in one["secret"]["items"]])
+            for one in pod["volumes"]
+            if "secret" in one
+        ]
+        for pod in pods
+    }
+
+
+def test_each_end_of_a_connection_has_the_credentials_of_its_access_domain() -> None:
+    credentials = "{edge: {secret: of-fleet, passwordKey: pw}}"
+    own = {DOMAINS: {"namespace: fleet": f"…, brokerCredentials: {credentials}"}}
+    of_fleet = ("of-fleet", ["username", "pw"])
+    assert secrets(own) == {"vehicle00": [of_fleet], "edge": []}
+    shared = {BROKERS: {"port: 1993": "…\n    credentials: {secret: all}"}}
+    of_all = ("all", ["username", "password"])
+    assert secrets(own | shared) == {"vehicle00": [of_fleet], "edge": [of_all]}
+
+
+def test_the_credentials_of_the_documentation_are_taken() -> None:
+    (example,) = re.findall(r"\n\n(    ros: .*\n(?:    .*\n)*)", PAGE)
+    config = load(configuration({DOMAINS: f"{skeleton()[DOMAINS]}{example}"}))
+    given = yaml.safe_load(example)
+    assert {node.ros.domain_id for node in config.nodes.values()} == {given["ros"]["domainId"]}
+    found = config.domains["perception"].broker_credentials
+    secrets = {node: {"secret": one.secret} for node, one in found.items()}
+    assert secrets == given["brokerCredentials"]

@@ -1,23 +1,104 @@
-"""A push that fails: the commit, the writer or nobody is refused, whatever the server's words."""
+"""Remotes that are away, silent or refuse: what waits, and who is told."""
 
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import subprocess
 import sys
+import threading
 from hashlib import sha256
 from pathlib import Path
 
 import pytest
 import yaml
+from demandops.base.errors import QueueFull, StateRepoError
 from demandops.repo.git.remote_repository import GitResult
 from demandops.repo.git.repository import MAIN, PushDenied
 from demandops.serve import approvals
+from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server
 from tests.kit.rig import NOW, Person, Proposed, Stages, goal
+
+# ---- away and back ----
+
+
+def test_without_a_clone_a_remote_that_is_away_is_told_at_once(bare: Path) -> None:
+    with pytest.raises(StateRepoError, match="cannot be fetched"):
+        Generator(bare.with_name("nothing.git").as_uri())
+
+
+# ---- denied ----
+
+
+def test_a_server_that_cannot_store_a_push_now_is_waited_for(
+    url: str, bare: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with rig.running(url) as generator:
+        objects, aside = bare / "objects", bare / "objects.aside"
+        objects.rename(aside)
+        (objects / "info").mkdir(parents=True)
+        (objects / "info" / "alternates").write_text(f"{aside}\n")
+        for number in range(256):  # the server fails to store objects
+            (objects / f"{number:02x}").touch()
+        ticket = generator.submit(goal(1))
+        rig.wait_until(lambda: "rejects the push: un" in caplog.text, "the log says why")
+        assert not ticket.future.done()
+        shutil.rmtree(objects)
+        aside.rename(objects)
+        assert rig.receipt(ticket).outcome == "booked"
+    rig.assert_sound(bare)
+
+
+@pytest.mark.parametrize(
+    ("server", "told"),
+    [
+        (["git@edge: Permission denied (publickey)"], "; git needs credentials"),
+        (  # the server ends in the middle of its answer, and git complains of that last
+            [
+                "warning: unable to access 'config': Input/output error",
+                "fatal: unknown error occurred while reading the configuration files",
+            ],
+            "$",
+        ),
+        (  # the server could not read the reference from its disk, and names a null id
+            [f"fatal: git upload-pack: not our ref {'0' * 40}"],
+            "; the server cannot read the branch",
+        ),
+        (
+            ["fatal: detected dubious ownership in repository at '/srv/state.git'"],
+            "; .* who owns the repository's files",
+        ),
+    ],
+    ids=["credentials", "cut off", "no reference", "owner"],
+)
+def test_a_remote_that_cannot_be_read_is_told_with_its_reason(
+    server: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The message leaves out git's last lines, which are the same whatever the reason is."""
+    ssh, words = tmp_path / "ssh", "\n".join(server)
+    begun = "printf '000eversion 2\\n'\n" if len(server) > 1 else ""
+    ssh.write_text(f'#!/bin/sh\n{begun}echo "{words}" >&2\nexit 255\n')
+    ssh.chmod(0o755)
+    monkeypatch.setenv("GIT_SSH_COMMAND", str(ssh))
+    reason = f"^ssh://edge/state.git cannot be fetched: {re.escape(server[0])}{told}"
+    with pytest.raises(StateRepoError, match=reason):
+        Generator("ssh://git@edge/state.git")
+
+
+def test_a_remote_with_main_checked_out_is_told_instead_of_tried_for_ever(
+    bare: Path, person: Person
+) -> None:
+    person.fetch()
+    with rig.running(person.folder.as_uri(), refusal_patience_s=0.5) as generator:
+        ticket = generator.submit(goal(1))
+        with pytest.raises(StateRepoError, match="checked out"):
+            rig.receipt(ticket)
+
 
 # ---- one commit is refused ----
 
@@ -58,25 +139,7 @@ def test_people_may_push_while_it_is_found_out_which_commit_is_refused(
 
 # ---- every commit is refused: the writer is ----
 
-SSH = """#!/bin/bash
-for last; do :; done
-case "$last" in
-git-upload-pack*) eval "$last";;
-git-receive-pack*) [ -e "$0.open" ] || { printf '%b\\n' "$SAYS" >&2; exit 1; }; eval "$last";;
-esac
-"""
 FRAME = "remote: \\nremote: ====\\nremote: \\nremote: {}\\nremote: \\nremote: ====\\nremote: "
-
-
-@pytest.fixture
-def ssh(bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A server over SSH that may be read; it may be written while the file ``ssh.open`` exists."""
-    program = tmp_path / "ssh"
-    program.write_text(SSH)
-    program.chmod(0o755)
-    monkeypatch.setenv("GIT_SSH_COMMAND", str(program))
-    monkeypatch.setenv("GIT_SSH_VARIANT", "simple")
-    return program
 
 
 @pytest.mark.parametrize(
@@ -227,3 +290,80 @@ def test_a_persons_settings_for_git_do_not_reach_the_generators_git(
     ran = request()
     assert ran.returncode == 0, ran
     assert f"{home}/.gitconfig:3" in ran.stderr and "mend that line" in ran.stderr
+
+
+# ---- a running generator follows what people merge, even if no demand comes ----
+
+SOON_S = 0.1
+
+
+def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> None:
+    with (
+        rig.running(url) as off,
+        rig.running(url, fetch_interval=SOON_S, data=tmp_path / "other") as on,
+    ):
+        rig.book(off, goal(1))
+        known = str(off.snapshot.commit)
+        made = person.edit("inventory/brokers.yaml", "service-mqtt-broker-edge", "elsewhere")
+        rig.wait_until(lambda: rig.tip(bare) != made, "the other generator follows")
+        commit = rig.tip(bare)
+        rig.wait_until(lambda: str(on.snapshot.commit) == commit, "the other generator knows")
+        assert str(off.snapshot.commit) == known
+        off.fetch_now()  # as after a webhook's call
+        rig.wait_until(lambda: str(off.snapshot.commit) == commit, "the generator follows now")
+
+
+# ---- the remote is slow, or away ----
+
+
+def test_a_fetch_that_hangs_delays_no_demand(http: str, server: Server, bare: Path) -> None:
+    with rig.running(http, fetch_interval=SOON_S) as generator:
+        rig.book(generator, goal(1))
+        hang = server.faults.hang = threading.Event()
+        rig.wait_until(lambda: generator._repository._process, "a fetch is under way and hangs")  # type: ignore[attr-defined]
+        talking = generator._repository._process  # type: ignore[attr-defined]
+        stages = Stages()
+        ticket = generator.submit(goal(2), listener=stages)
+        rig.wait_until(
+            lambda: "committed" in stages.names, "the demand is committed although the fetch hangs"
+        )
+        assert talking.poll() is not None, "the fetch must be ended for the demand"
+        assert not generator.remote_status.unreachable
+        server.faults.hang = None
+        hang.set()
+        assert rig.receipt(ticket).outcome == "booked"
+    rig.assert_sound(bare)
+
+
+@pytest.mark.parametrize("sends", [False, True], ids=["a look", "a push"])
+def test_stopping_does_not_wait_for_a_server_that_never_answers(
+    http: str, server: Server, bare: Path, sends: bool
+) -> None:
+    generator = Generator(http, fetch_interval=0 if sends else SOON_S)
+    hang = server.faults.hang = threading.Event()
+    try:
+        if sends:
+            generator.submit(goal(1), "op-1")
+        rig.wait_until(lambda: server.faults.hanging, "the server has a request")
+        stopped = generator.stop(timeout=0.5 if sends else 2 * rig.PATIENCE_S)
+        assert stopped.result(rig.PATIENCE_S) is not sends
+    finally:
+        server.faults.hang = None
+        hang.set()
+    assert rig.restart(http) is True
+    assert rig.operations(bare) == ["op-1"] * sends
+
+
+def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server) -> None:
+    with rig.running(http, fetch_interval=SOON_S, queue_limit=3) as generator:
+        server.faults.away = True
+        rig.wait_until(
+            lambda: generator.remote_status.unreachable, "the remote is known to be away"
+        )
+        tickets = [generator.submit(goal(number)) for number in range(500)]
+        # the worker may take demands from the queue into its batch, so the last may find room
+        rig.wait_until(lambda: any(one.future.done() for one in tickets), "a demand is refused")
+        refused = next(one for one in tickets if one.future.done())
+        with pytest.raises(QueueFull, match=r"503"):
+            rig.receipt(refused)
+        server.faults.away = False
