@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from demandops.model.demand.demand import Application
 
 from tests.kit.config import skeleton
 from tests.kit.goals import CLOUD, application, goal
-from tests.kit.memory import MemoryRepo, rebuilt
+from tests.kit.memory import MemoryRepo
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "lane-detection"
 PAGE = (EXAMPLE / "README.md").read_text()
@@ -99,32 +97,3 @@ def test_object_detection_reads_the_driver_that_lane_detection_has(books: Memory
     books.send(RELEASE)
     ((name, left),) = of_lidars(books).items()
     assert (name, left["parameters"]) == ("lidar-vehicle00-vehicle00", {"rate_hz": 10})
-
-
-def test_the_bookkeeping_accepts_two_claims_that_a_person_made_inconsistent(
-    books: MemoryRepo,
-) -> None:
-    (app,) = DEMAND["applications"]
-    app = app | {"inputs": {"point_cloud": [{"topic": "/points", "source": "vehicle01"}]}}
-    books.send(DEMAND | {"applications": [app]})
-    books.send(DEMAND | {"demand": "more", "applications": [app | {"id": "edge/more"}]})
-    claims = [
-        replace(claim, held=marked_further(claim.application))
-        if claim.demand == "more" and claim.is_on_application
-        else claim
-        for claim in books.state.ledger
-    ]
-    books.state = replace(books.state, ledger=rebuilt(claims))
-    (lanes,) = (
-        one["inputs"]
-        for one in books.books()["services"].values()
-        if (one["service"], one["source"]) == ("lane-detection", "vehicle01")
-    )
-    assert lanes == {"points": {"/vehicle01_points": ["vehicle00"]}}
-
-
-def marked_further(app: Application) -> Application:
-    inputs = app.inputs.items()
-    return app.with_inputs(
-        {role: tuple(replace(t, further=True) for t in ts) for role, ts in inputs}
-    )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from operator import itemgetter
 from typing import Any
 
 import pytest
@@ -19,6 +20,7 @@ from demandops.decide.planning.planner import affected_keys
 from demandops.decide.state import State, rendered_files
 from demandops.model.ledger.ledger import changes_on
 
+from tests.kit import plain_yaml
 from tests.kit.config import skeleton
 from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.goals import connection, goal
@@ -116,26 +118,16 @@ def test_what_is_not_configured_is_left_out_and_an_ipv6_host_becomes_part_of_a_u
         assert spec["containers"][0]["args"][3] == "standalone.launch.xml", "as the image has it"
 
 
-@pytest.mark.parametrize(
-    ("kind", "route", "lost", "field", "told"),
-    [
-        ("zenoh", Route("/a", "/a", qos=1), {}, "connections", "'c': qos of '/a' is not supported"),
-        ("ros", Route("/a", "/b"), {}, "connections", "'c': '/a' cannot become '/b'"),
-        ("zenoh", None, {"vehicle00": {}}, "node", "'vehicle00' carries Zenoh connections, but"),
-        ("ros", None, {"edge": {}}, "connections", "connection 'c' has no end with a wan address"),
-        ("ros", None, {"vehicle00": {}}, "connections", "'c': the message type of '/a' is not"),
-        ("zenoh", None, {"images": ""}, "images", "'zenoh-bridge' is in use, but not in registry"),
-    ],
-    ids=["an option", "a name", "no bridge", "no address", "no message type", "no image"],
-)
+@pytest.mark.parametrize("case", plain_yaml.beside(__file__), ids=itemgetter("told"))
 def test_what_people_change_in_git_so_that_the_type_cannot_carry_it_is_told(
-    kind: str, route: Route | None, lost: dict[str, Any], field: str, told: str
+    case: dict[str, Any],
 ) -> None:
-    repo = booked(demand(kind))
+    repo = booked(demand(case["kind"]))
     (claim,) = repo.state.ledger.connection_claims("c")
-    held = replace(claim.connection, topics=(route or Route("/a", "/a"),))
+    route = Route(**{"source": "/a", "target": "/a"} | case.get("route", {}))
+    held = replace(claim.connection, topics=(route,))
     ledger = repo.state.ledger.replace(claim.key, replace(claim, held=held))
     with pytest.raises(Refused) as refused:
-        rendered_files(replace(state(**(NODES | lost)), ledger=ledger))
+        rendered_files(replace(state(**(NODES | case.get("lost", {}))), ledger=ledger))
     found = refused.value.faults[0]
-    assert (found.field, found.message[: len(told)]) == (field, told)
+    assert (found.field, found.message[: len(case["told"])]) == (case["field"], case["told"])

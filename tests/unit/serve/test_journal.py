@@ -26,6 +26,7 @@ from demandops.serve.journal import (
     read,
 )
 
+from tests.kit import plain_yaml
 from tests.kit.chance import IN_FULL
 from tests.kit.limits import files_end_at
 from tests.kit.memory import NOW
@@ -193,17 +194,8 @@ def of_the_first_version(*records: object) -> bytes:
     return b"".join(json.dumps(record).encode() + b"\n" for record in records)
 
 
-_AT = "2026-01-31T12:00:00"
-WAITING = {"operation": "op-1", "goal": {"id": 1}, "received": f"{_AT}+00:00", "base": ""}
-PROPOSED = {**WAITING, "operation": "op-2", "proposal": {"branch": "demand/x", "commits": ["a"]}}
-NOT_WRITTEN = (
-    *(42, None, {}, {"done": []}, {"operation": "x"}),
-    *(WAITING | wrong for wrong in ({"operation": 5}, {"base": 5})),
-    *(WAITING | {"received": at} for at in (_AT, "9999-12-31T23:59:59+00:00")),
-    WAITING | {"received": "1969-12-31T23:59:59+00:00"},
-    *(PROPOSED | {"proposal": one} for one in ({}, {"branch": "x"}, "x", "", [])),
-    PROPOSED | {"proposal": {"branch": "x", "commits": [], "brunch": ""}},
-)
+RECORDS = plain_yaml.beside(__file__)
+WAITING, PROPOSED = RECORDS["waiting"], RECORDS["proposed"]
 
 
 def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:
@@ -217,7 +209,7 @@ def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", [b"\x00\xff\n", b"[" * 9999 + b"\n", *map(of_the_first_version, NOT_WRITTEN)]
+    "line", [b"\x00\xff\n", b"[" * 9999 + b"\n", *map(of_the_first_version, RECORDS["not written"])]
 )
 def test_a_line_that_the_first_version_did_not_write_is_damage(line: bytes) -> None:
     with pytest.raises(DamagedJournal, match="line 2 is not what"):
