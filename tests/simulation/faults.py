@@ -133,7 +133,7 @@ def take_one_common_requester_for_the_owner(
     return () if owners & {*request.requesters()} else faults(request, owners, *more)
 
 
-@wrong(57, Claim, "without_topics")
+@wrong(2, Claim, "without_topics")
 def end_the_whole_claim_by_a_shutdown_of_some_topics(_: Any, claim: Any, gone: Any) -> None:
     return None
 
@@ -269,7 +269,7 @@ def let_the_lowest_priority_win(right: Any, world: Any) -> None:
     object.__setattr__(world, "overrides", world.overrides[::-1])
 
 
-@wrong(9, overrides, "fits")
+@wrong(20, overrides, "fits")
 def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bool:
     return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
 
@@ -278,7 +278,7 @@ plant("run_what_is_denied", 29, planner, "without_suspended", itself)
 plant("book_what_is_denied", 3, forbidden, "denial_faults", lambda *_: ())
 
 
-@wrong(0, edits, "expired_overrides")
+@wrong(3, edits, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
 
@@ -352,7 +352,7 @@ def bring_back_what_was_deleted(follow: Any, batch: Any, followed: Any, now: Any
         batch.commit_files(files, state, "Undo\n\nRender-Version: 3\n", author, now)
 
 
-@wrong(128, Approvals, "_has_moved")
+@wrong(382890171, Approvals, "_has_moved")
 def answer_before_a_last_merge_is_seen(moved: Any, *check: Any) -> bool:
     return False
 
