@@ -352,6 +352,11 @@ def bring_back_what_was_deleted(follow: Any, batch: Any, followed: Any, now: Any
         batch.commit_files(files, state, "Undo\n\nRender-Version: 3\n", author, now)
 
 
+@wrong(128, Approvals, "_has_moved")
+def answer_before_a_last_merge_is_seen(moved: Any, *check: Any) -> bool:
+    return False
+
+
 @wrong(1, Approvals, "_receipt")
 def book_again_what_was_approved(
     receipt: Any, made: Any, ticket: Any, decision: Any, snapshot: Any, recorded: Any

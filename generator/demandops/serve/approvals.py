@@ -305,6 +305,7 @@ class Approvals:
         if verdict.unrecorded:
             self._unrecorded.append((proposal, verdict.unrecorded))
             return
+        tickets, commits, searched = proposal.tickets, proposal.record.commits, proposal.searched_to
         proposal.searched_to = tip
         booked = [
             (ticket, self._receipt(ticket, decision, snapshot, on_main.get(ticket.operation)))
@@ -316,7 +317,7 @@ class Approvals:
             if booked and not head:  # a person merged only some of the demands
                 proposal.record = replace(proposal.record, pushed=False)
             # the branch is to contain only the demands that still need approval
-            before, is_updated = proposal.tickets, False
+            is_updated = False
             proposal.tickets = [ticket for ticket, _ in verdict.unapproved]
             proposal.requests = [decision.request for _, decision in verdict.unapproved]
             why = (reason for _, decision in verdict.unapproved for reason in decision.approval)
@@ -325,7 +326,7 @@ class Approvals:
                 is_updated = self._update(proposal, verdict, snapshot, heads)
             finally:
                 if not is_updated:  # the branch has them all still, and so has the next check
-                    proposal.tickets = [ticket for ticket in before if ticket.state != "done"]
+                    proposal.tickets = [ticket for ticket in tickets if ticket.state != "done"]
             if not is_updated:
                 self._changed.append(proposal.branch)
                 return
@@ -334,12 +335,29 @@ class Approvals:
             if proposal.record.commits and (not booked or head in proposal.record.commits):
                 self._delete_branch(proposal.branch, heads)
             self._delete_replaced(proposal, heads)
+        if (verdict.failed or verdict.free) and self._has_moved(proposal, commits, head, heads):
+            proposal.tickets = [ticket for ticket in tickets if ticket.state != "done"]
+            proposal.searched_to = searched
+            self._changed.append(proposal.branch)
+            return
         # the branch no longer has these demands, so nobody can merge them
         self._demands.answer(verdict.failed)
         self._demands.requeue(verdict.free)
         if not verdict.unapproved:
             cause = next((error for _, error in verdict.failed), "it needs no approval any more")
             self._forget(proposal, "" if booked else str(cause))
+
+    @staticmethod
+    def _has_moved(
+        proposal: Proposal, commits: tuple[str, ...], head: str, heads: BranchHeads
+    ) -> bool:
+        """Return whether this check has moved or removed the branch.
+
+        A person may have merged the branch just before, which only a main shows that is read after
+        that. So the next check answers.
+        """
+        is_there = heads.branches.get(proposal.branch, "") == head
+        return not is_there or proposal.record.commits != commits
 
     def _receipt(
         self,
