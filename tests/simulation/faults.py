@@ -274,7 +274,7 @@ def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bo
     return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
 
 
-plant("run_what_is_denied", 14, planner, "without_suspended", itself)
+plant("run_what_is_denied", 283, planner, "without_suspended", itself)
 plant("book_what_is_denied", 3, forbidden, "denial_faults", lambda *_: ())
 
 
@@ -406,10 +406,10 @@ def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
 plant(
     "resume_in_reverse", 15, journal, "read", lambda read, path: dict([*read(path).items()][::-1])
 )
-plant("skip_the_search_for_operations", 21, Worker, "_published_before", lambda *_: [])
+plant("skip_the_search_for_operations", 62, Worker, "_published_before", lambda *_: [])
 
 
-@wrong(17, snapshot, "start_at")
+@wrong(24, snapshot, "start_at")
 def start_without_overrides(first: Any, *given: Any) -> Any:
     found = first(*given)
     config = replace(found.state.config, overrides={})
