@@ -75,6 +75,8 @@ class Thing:
 
 def find(source: Source, name: str, kind: str | None = None) -> Thing:
     # only the history up to the commit of ``source`` counts
+    if not name.strip():
+        raise InvalidInput.at("NAME", "is empty; name a thing, such as a release or a demand")
     reader = source.reader()
     if name.startswith(("clusters/", "bootstrap/", f"{claim_files.LEDGER_ROOT}/")):
         return _by_path(source, reader, name.rstrip("/"))

@@ -115,6 +115,8 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
       demandops diff 14:03
       demandops diff main~1 main
     """
+    if not before.strip():  # as of a variable that is not set
+        raise InvalidInput.at("A", "is empty; name a commit or a time")
     with reader.opened(state_repo) as repo:
         try:
             entries, changes = differences(repo, before, after)
