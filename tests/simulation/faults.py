@@ -222,8 +222,8 @@ plant("leave_the_far_end", 0, ConnectionType, "keys", first_only)
 
 # ---- placement ----
 
-plant("let_the_last_in_first", 16, agenda, "in_turn", in_reverse)
-plant("ignore_priorities", 98, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
+plant("let_the_last_in_first", 9, agenda, "in_turn", in_reverse)
+plant("ignore_priorities", 187, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
 
 
 @wrong(3, decision, "_wait")
