@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from demandops.repo import reader
+from demandops.repo.history import commit_log
 from demandops.serve.generator import Generator
 
 from tests.benchmarks import fleet
@@ -49,13 +50,14 @@ def timed(what: str, call: Callable[[], object]) -> None:
 def measure(repo: Path) -> None:
     with reader.opened(str(repo)) as opened:
         tip = opened.commit()
+        path_of = partial(commit_log.release_path, opened.objects, tip)
         timed("loading the newest commit", lambda: len(opened.snapshot().state.ledger))
-        old = opened.release_path("od-edge00001-v00001x0", tip)
-        often = opened.release_path(f"of-{fleet.edge_id(0)}-fusion", tip) or _fusion(opened, tip)
+        old = path_of("od-edge00001-v00001x0")
+        often = path_of(f"of-{fleet.edge_id(0)}-fusion") or _fusion(opened, tip)
         timed("history of a file that is as it was at first", lambda: _told(opened, old, tip))
         timed("history of a file that changed often", lambda: _told(opened, often, tip))
         gone = f"od-{fleet.edge_id(0)}-{fleet.spare_id(0)}"
-        timed("history of a release that stopped", lambda: opened.release_path(gone, tip))
+        timed("history of a release that stopped", lambda: path_of(gone))
         first = f"{[*opened.log()][-1].time:%Y-%m-%dT%H:%M:%S}"
         timed("a time at the far end", lambda: opened.commit(first)[:10])
         timed("log of one requester", lambda: sum(1 for e in opened.log() if gone in e.summary))

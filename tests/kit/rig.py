@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from demandops.base.errors import InvalidInput
-from demandops.repo.slot import Slot
+from demandops.repo.git.remote_repository import Slot
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Receipt, Ticket, open_journal
 

@@ -52,6 +52,7 @@ class Asked:
     is_answered: bool = False
     is_lost: bool = False
     is_withdrawn: bool = False
+    is_asked_back: bool = False
     must_resume: bool = False
     """Whether a stop left it to the next start."""
 
@@ -112,7 +113,11 @@ class Oracle:
 
     def withdraw(self, asked: Asked) -> None:
         assert asked.machine.generator is not None
+        asked.is_asked_back = True  # its answer comes before the call returns
         asked.is_withdrawn |= asked.machine.generator.withdraw(asked.ticket.operation)
+        asked.is_asked_back = False
+        if asked.ticket.future.done() and not (asked.is_withdrawn or asked.needs_approval):
+            assert not isinstance(asked.ticket.future.exception(), Withdrawn), "nobody did"
 
     def check(self) -> None:
         self._guard(self._follow_main)
@@ -294,7 +299,8 @@ class Oracle:
         place = self._place.get(operation)
         if error is not None:
             is_withdrawn = isinstance(error, Withdrawn)
-            assert asked.is_withdrawn or asked.needs_approval or not is_withdrawn, "nobody did"
+            may_be = asked.is_withdrawn or asked.is_asked_back or asked.needs_approval
+            assert may_be or not is_withdrawn, "nobody did"
             assert "internal error" not in str(error), error
             assert place is None, f"{operation} is booked, but was answered {error}"
             is_decided = any(branch in str(error) for branch in self.decided)

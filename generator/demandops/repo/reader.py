@@ -16,16 +16,14 @@ from demandops.base import naming, settings
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import with_lines
-from demandops.decide.booking import Restoration
 from demandops.decide.state import FileReader, rendered_files
 from demandops.model.config.config import Config
 from demandops.model.config.override import OVERRIDES_ROOT, override_selects
-from demandops.model.demand.demand import Rollback
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import verification
 from demandops.repo.git import repository as repositories
 from demandops.repo.git import tree as trees
-from demandops.repo.git.remote_repository import connect, is_url
+from demandops.repo.git.remote_repository import Slot, connect, is_url
 from demandops.repo.git.repository import StateRepository, access_error, reading
 from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
@@ -33,8 +31,7 @@ from demandops.repo.history.commit_message import PROPOSAL
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.ledger_files import valid_claim_at
-from demandops.repo.load.snapshot import Problem, Progress, Snapshot
-from demandops.repo.slot import Slot
+from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.verification import Verdict
 
 
@@ -44,7 +41,7 @@ class Reader:
     def __init__(self, repository: StateRepository, tip: Oid, slot: Slot | None = None) -> None:
         self.repository, self._tip, self._slot = repository, tip, slot
         self._merged: tuple[Oid | None, Mapping[str, Commit]] = (None, {})  # of main at a commit
-        self._objects = repository.objects
+        self.objects = repository.objects
 
     @classmethod
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
@@ -80,42 +77,33 @@ class Reader:
         # at the same commit, without a fetch
         other = Reader(self.repository, self._tip)
         try:
-            other._objects = self.repository.reopened()
+            other.objects = self.repository.reopened()
         except (pygit2.GitError, OSError) as error:
             raise StateRepoError(f"{self.repository.address} cannot be read: {error}") from None
         return other
 
-    def refuse_other_render_version(self) -> None:
-        snapshots.refuse_other_render_version(self._objects, self._tip)
-
     def commit(self, revision: str | None = None) -> str:
         if not revision:
             return str(self._tip)
-        return str(commit_log.resolve(self._objects, self._tip, revision, REAL.now()).id)
+        return str(commit_log.resolve(self.objects, self._tip, revision, REAL.now()).id)
 
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
         commit = self.commit(revision)
         try:
-            return snapshots.state_at(self._objects, commit, progress)
+            return snapshots.state_at(self.objects, commit, progress)
         except InvalidInput as error:
             raise InvalidInput(with_lines(error.faults, self.file_reader(commit))) from None
 
     def snapshot_after(self, before: Snapshot) -> Snapshot:
-        now = commit_log.time_of(trees.commit_of(self._objects, self._tip))
-        return snapshots.follow(self._objects, before, self._tip, now).snapshot
-
-    def problems_of(self, snapshot: Snapshot) -> tuple[Problem, ...]:
-        return snapshots.problems_of(self._objects, snapshot)
-
-    def how_to_mend(self, snapshot: Snapshot) -> str:
-        return snapshots.how_to_mend(self._objects, snapshot) if snapshot.faults else ""
+        now = commit_log.time_of(trees.commit_of(self.objects, self._tip))
+        return snapshots.follow(self.objects, before, self._tip, now).snapshot
 
     def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
         # only a person's commit may leave such files, and rendering everything takes time
-        commit = trees.commit_of(self._objects, snapshot.commit)
-        if commit_log.is_by_generator(self._objects, commit):
+        commit = trees.commit_of(self.objects, snapshot.commit)
+        if commit_log.is_by_generator(self.objects, commit):
             return frozenset()
         try:
             return self._unlike_rendered(snapshot)
@@ -123,7 +111,7 @@ class Reader:
             return frozenset()
 
     def _unlike_rendered(self, snapshot: Snapshot) -> frozenset[str]:
-        tree = trees.commit_of(self._objects, snapshot.commit).tree
+        tree = trees.commit_of(self.objects, snapshot.commit).tree
         texts = trees.texts(tree, settings.GENERATED_ROOTS)
         current = {path: text for path, text in texts.items() if not trees.is_readme(path)}
         wanted = rendered_files(snapshot.state, current)
@@ -149,7 +137,7 @@ class Reader:
         return sorted({path for path, _ in trees.differences(old, new)} - as_rendered - claims)
 
     def _tree(self, revision: str | None = None) -> Tree:
-        return trees.commit_of(self._objects, self.commit(revision)).tree
+        return trees.commit_of(self.objects, self.commit(revision)).tree
 
     def file_reader(self, revision: str | None = None) -> FileReader:
         tree = self._tree(revision)
@@ -162,23 +150,23 @@ class Reader:
         # newest first; the commits up to REV, after A up to B in ``A..B``, or all
         since, until = self._sides(spec or "")
         if path is not None:
-            changes = commit_log.changes_to(self._objects, until, path, since)
+            changes = commit_log.changes_to(self.objects, until, path, since)
             return (self._answered(entry) for entry, _, _ in changes)
-        entries = (entry for _, entry in commit_log.commits(self._objects, until, since))
+        entries = (entry for _, entry in commit_log.commits(self.objects, until, since))
         return map(self._answered, entries)
 
     def _answered(self, entry: LogEntry) -> LogEntry:
         # which merges main has is looked up once, and only if somebody asks for a proposal's commit
         if PROPOSAL in entry.trailers and self._merged[0] != self._tip:
-            self._merged = self._tip, commit_log.merges(self._objects, self._tip)
-        return commit_log.answered(self._objects, entry, self._tip, self._merged[1])
+            self._merged = self._tip, commit_log.merges(self.objects, self._tip)
+        return commit_log.answered(self.objects, entry, self._tip, self._merged[1])
 
     def revisions(self, spec: str | None) -> list[str]:
         # oldest first; the commit REV, those after A up to B in ``A..B``, or the newest one
         since, until = self._sides(spec or "")
         if since is None:
             return [until]
-        walked = commit_log.commits(self._objects, until, since)
+        walked = commit_log.commits(self.objects, until, since)
         return [entry.commit for _, entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
@@ -197,13 +185,13 @@ class Reader:
         progress: Progress = lambda done, total: None,
     ) -> list[Verdict]:
         verdicts = list[Verdict]()
-        for verdict in verification.verify(self._objects, commits, whole=whole):
+        for verdict in verification.verify(self.objects, commits, whole=whole):
             verdicts.append(verdict)
             progress(len(verdicts), len(commits))
         return verdicts
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
-        history = commit_log.history_of(self._objects, revision, path, most)
+        history = commit_log.history_of(self.objects, revision, path, most)
         return replace(
             history,
             started=history.started and self._answered(history.started),
@@ -211,34 +199,28 @@ class Reader:
             stopped=history.stopped and self._answered(history.stopped),
         )
 
-    def release_path(self, name: str, revision: str) -> str | None:
-        return commit_log.release_path(self._objects, revision, name)
-
-    def stopped_releases(self, revision: str) -> dict[str, list[str]]:
-        return commit_log.stopped_releases(self._objects, revision)
-
     def changed_files(self, before: str, after: str, roots: Sequence[str] = ()) -> list[str]:
         changed = trees.differences(self._tree(before), self._tree(after), roots)
         return sorted(path for path, _ in changed)
 
     def base_of(self, commit: str) -> str:
         # the commit at which another one, of a proposal, left main
-        base = self._objects.merge_base(self._tip, trees.commit_of(self._objects, commit).id)
+        base = self.objects.merge_base(self._tip, trees.commit_of(self.objects, commit).id)
         return str(base or self._tip)
 
     def changed_roots(self, commit: str) -> tuple[str, ...]:
-        opened = trees.commit_of(self._objects, commit)
+        opened = trees.commit_of(self.objects, commit)
         before = {entry.name: entry.id for entry in trees.parent_tree(opened) or ()}
         after = {entry.name: entry.id for entry in opened.tree}
         changed = {name for name in {*before, *after} if before.get(name) != after.get(name)}
         return tuple(sorted(map(str, changed)))
 
     def files_changed_by(self, commit: str) -> list[str]:
-        after = trees.commit_of(self._objects, commit)
+        after = trees.commit_of(self.objects, commit)
         return sorted(path for path, _ in trees.differences(trees.parent_tree(after), after.tree))
 
     def changes_node(self, commit: str, node: str) -> bool:
-        opened = trees.commit_of(self._objects, commit)
+        opened = trees.commit_of(self.objects, commit)
         before, after = trees.parent_tree(opened), opened.tree
         if before is None:
             return False
@@ -258,7 +240,7 @@ class Reader:
         """
         if entry.by_generator and entry.first("Operation") != "expire-override":
             return False
-        commit = trees.commit_of(self._objects, entry.commit)
+        commit = trees.commit_of(self.objects, entry.commit)
         sides = trees.parent_tree(commit), commit.tree
         roots = (OVERRIDES_ROOT, "inventory") if kind == "node" else (OVERRIDES_ROOT,)
         paths = {path for path, _ in trees.differences(*sides, roots)}
@@ -276,14 +258,11 @@ class Reader:
         since, follows = entry.first("Since"), entry.first("Follows")
         if not (entry.by_generator and since and follows):
             return []
-        people = commit_log.person_commits(self._objects, follows, since)
+        people = commit_log.person_commits(self.objects, follows, since)
         return [commit_log.entry_of(commit) for commit in islice(people, most)]
 
-    def restoration(self, rollback: Rollback) -> Restoration:
-        return ledger_files.restoration(self._objects, rollback)
-
     def operator(self) -> Person:
-        return commit_log.operator(self._objects.path)
+        return commit_log.operator(self.objects.path)
 
 
 def _item(text: str, id: str) -> str:

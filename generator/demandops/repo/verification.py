@@ -16,7 +16,7 @@ from demandops.base.settings import (
     REPORTS_ROOT,
 )
 from demandops.decide.planning.planner import ReleaseKey, affected_keys, all_keys, plan
-from demandops.decide.state import State, rendered_files
+from demandops.decide.state import rendered_files
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
@@ -32,6 +32,7 @@ from demandops.repo.history.commit_log import LogEntry, entry_of
 from demandops.repo.history.commit_message import PROPOSAL
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
+from demandops.repo.load.snapshot import Snapshot
 
 # ---- the files that a commit of the generator changed, but was not allowed to change ----
 #
@@ -147,42 +148,32 @@ class _Unreadable(Exception):
 
 class _Proof:
     # the files that a commit should have, rendered again to compare with its committed files
-    def __init__(self, state: State, commit: Commit, source: Tree) -> None:
-        self.state, self._commit = state, commit
-        self._configuration = snapshots.config_ids(source)
+    def __init__(self, snapshot: Snapshot, commit: Commit) -> None:
+        self.snapshot, self.state, self._commit = snapshot, snapshot.state, commit
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
         # with an override that sets ``hold``: such a file's text depends on the parent commit
         self._held: dict[ReleaseKey, Release] = {}
-        base_files = gitops.base_files(state.config)
+        base_files = gitops.base_files(self.state.config)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
         self._committed = _generated_files(commit.tree)
-        self._render(all_keys(state))
+        self._render(all_keys(self.state))
 
-    def can_advance_to(self, commit: Commit, source: Tree) -> bool:
-        # ``source`` has the configuration, which may affect all releases, as ended overrides may
-        return snapshots.config_ids(source) == self._configuration and not trees.differ(
-            self._commit.tree, commit.tree, (records.MARKERS_ROOT,)
-        )
-
-    def advance(self, commit: Commit) -> None:
+    def advanced(self, snapshot: Snapshot, commit: Commit) -> bool:
+        # not if all releases may be affected, as by a configuration and by ended overrides
+        old, new = self.state, snapshot.state
+        if new.config is not old.config or new.ledger.ended != old.ledger.ended:
+            return False
         before, after = self._commit.tree, commit.tree
-        try:
-            changes = [
-                ClaimChange(*(ledger_files.claim_at(tree, path) for tree in (before, after)))
-                for path in ledger_files.changed_files(before, after)
-            ]
-        except InvalidInput as error:
-            raise _Unreadable(error.faults[0]) from None
-        ledger = self.state.ledger
-        for change in changes:
-            ledger = ledger.replace(change.key, change.after)
+        changes = [
+            ClaimChange(*(ledger_files.claim_at(tree, path) for tree in (before, after)))
+            for path in ledger_files.changed_files(before, after)
+        ]
         for path, blob in trees.differences(before, after, GENERATED_ROOTS):
             self._committed.pop(path, None)
-            if blob is not None:
-                self._committed[path] = blob
-        before_state, self._commit = self.state, commit
-        self.state = replace(before_state, ledger=ledger)
-        self._render(affected_keys(before_state, self.state, changes))
+            self._committed |= {path: blob} if blob is not None else {}
+        self.snapshot, self.state, self._commit = snapshot, new, commit
+        self._render(affected_keys(old, new, changes))
+        return True
 
     def _render(self, keys: Iterable[ReleaseKey]) -> None:
         for key in keys:
@@ -244,18 +235,17 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         try:
             verdict = replace(verdict, touched=tuple(sorted(disallowed_files(repo, commit, entry))))
             if whole or place == len(commits):
-                state = _loaded(repo, commit, entry)
+                state = _loaded(repo, commit, entry).state
                 parent = trees.parent_tree(commit) if _holds(state) else None
                 held = trees.texts(parent, GENERATED_ROOTS) if parent is not None else {}
                 wanted = {path: _blob(t) for path, t in rendered_files(state, held).items()}
                 differing = _differing(wanted, _generated_files(commit.tree))
             else:
-                source = trees.commit_of(repo, snapshots.configuration_of(repo, commit, entry)).tree
-                if before is not None and before.can_advance_to(commit, source):
-                    before.advance(commit)
+                snapshot = _loaded(repo, commit, entry, before.snapshot if before else None)
+                if before and before.advanced(snapshot, commit):
                     proof = before
                 else:
-                    proof = _Proof(_loaded(repo, commit, entry), commit, source)
+                    proof = _Proof(snapshot, commit)
                 differing = proof.differing()
         except _Unreadable as error:
             why = f"a file was not valid at this commit: {error}"
@@ -269,14 +259,16 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
             yield replace(verdict, holds=holds, differing=differing)
 
 
-def _loaded(repo: Repository, commit: Commit, entry: LogEntry) -> State:
+def _loaded(
+    repo: Repository, commit: Commit, entry: LogEntry, before: Snapshot | None = None
+) -> Snapshot:
     try:
-        snapshot = snapshots.load(repo, commit.id, entry=entry)
+        snapshot = snapshots.load(repo, commit.id, entry=entry, before=before)
     except InvalidInput as error:
         raise _Unreadable(error.faults[0]) from None
     if snapshot.claim_faults:
         raise _Unreadable(snapshot.claim_faults[0])
-    return snapshot.state
+    return snapshot
 
 
 def _differing(wanted: Mapping[str, Oid], committed: Mapping[str, Oid]) -> tuple[str, ...]:

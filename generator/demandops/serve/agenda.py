@@ -48,6 +48,9 @@ CHECK_REMOTE_S = 5.0
 # take at most a tenth of the worker's time while main moves.
 _PAUSE_FACTOR = 9
 
+# How many times the duration of a judgement passes before the next one: each renders all releases.
+_JUDGING_PAUSE_FACTOR = 20
+
 # By how much the clock may gain on the monotonic clock before this counts as a jump.
 _JUMP_S = 30.0
 # The shortest grace of a lease. The ledger keeps a lease that has ended while its grace lasts, and
@@ -58,7 +61,7 @@ _SHORTEST_LOOK_S = 1.0
 # After this processor time, new demands come before the waiting demands that were not tried yet.
 _LONGEST_ROUND_S = 0.25
 
-What = Literal["leases", "own work", "fetch", "check"]
+What = Literal["leases", "own work", "fetch", "check", "judge"]
 
 
 def parse_interval(text: str) -> float:
@@ -77,6 +80,7 @@ class Agenda:
     | own work | ends of overrides, drains, demands that wait for room: each batch begins with it |
     | fetch | at an interval, and soon after a request |
     | check | of the proposals: soon after main has moved, else at an interval |
+    | judge | the configuration of main again, if it is not in effect and claims have ended |
 
     What failed waits, each time twice as long, up to a minute: one of these, the end of an override
     or of a lease, or the drain of a node. These last three are tried again at once if a person
@@ -106,6 +110,7 @@ class Agenda:
         self._logged: dict[str, frozenset[str]] = {}
         self._tried: World | None = None
         self.left: list[str] = []  # waiting demands that the last round left for later
+        self.must_judge, self._judge_at = False, now
 
     def due_in(self, state: State, main: str, *, has_news: bool = False) -> dict[What, float]:
         # in seconds; ``main`` is empty if no proposal awaits approval, and ``has_news`` says
@@ -137,6 +142,7 @@ class Agenda:
             "fetch": fetch,
             # after a failure, the remote is likely away
             "check": max(check - now, self.waits_s("check")),
+            "judge": self._judge_at - now if self.must_judge else inf,
         }
         return {what: max(seconds, rest, 0.0) for what, seconds in due.items()}
 
@@ -333,6 +339,10 @@ class Agenda:
     def check_begins(self) -> None:
         self._check_began = self._runtime.monotonic()
         self.failed("check", first=self._check_interval)  # unless it ends
+
+    def judged(self, began: float) -> None:
+        now = self._runtime.monotonic()
+        self._judge_at = now + _JUDGING_PAUSE_FACTOR * (now - began)
 
     def checked(self, main: str) -> None:
         now = self._runtime.monotonic()

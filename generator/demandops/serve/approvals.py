@@ -21,7 +21,6 @@ from demandops.base import errors
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, fault
 from demandops.base.quoting import quoted
 from demandops.base.settings import PROPOSAL_LIMIT, RENDER_VERSION
-from demandops.cluster.rollouts import targets_of_decision
 from demandops.decide.decision import Decision
 from demandops.decide.state import State
 from demandops.model.demand.demand import Demand
@@ -86,7 +85,7 @@ class Approvals:
     ) -> None:
         self._repository, self._runtime = repository, repository.runtime
         self._demands = demands
-        self._with_targets = with_targets
+        self.with_targets = with_targets
         self.branches = ProposalBranches(repository)
 
         def on_update(branch: str) -> None:
@@ -370,22 +369,9 @@ class Approvals:
         # a person merged the demand, but a later commit changed its files
         if isinstance(decision, InvalidInput) or decision.files:
             return Receipt(ticket.operation, ticket.demand.id, "booked", commit)
-        receipt = self.receipt(ticket, decision, commit, snapshot.state)
+        before, operation = snapshot.state, ticket.operation
+        receipt = Receipt.of(operation, decision, commit, before, self.with_targets)
         return replace(receipt, outcome="booked")
-
-    def receipt(self, ticket: Ticket, decision: Decision, commit: str, before: State) -> Receipt:
-        return Receipt(
-            operation=ticket.operation,
-            request_id=decision.request.id,
-            outcome=decision.outcome,
-            commit=commit,
-            warnings=decision.warnings,
-            not_held=decision.changes.not_held,
-            placed=decision.placed,
-            lease_s=decision.lease_s,
-            targets=targets_of_decision(before, decision) if self._with_targets else (),
-            changes=decision.changes.claims,
-        )
 
     # ---- the branch and its pull request ----
 
@@ -510,7 +496,7 @@ class Approvals:
 
 def _release_request(ticket: Ticket, state: State) -> Demand | None:
     # None also if the request would be refused
-    if ticket.state == "withdrawn" or not ticket.demand.is_release:
+    if ticket.withdrawn or not ticket.demand.is_release:
         return None
     return admit_or_none(state, ticket.demand)
 

@@ -6,7 +6,7 @@
 | queued | is in the journal and may be evaluated | committed, proposed, withdrawn, done |
 | committed | has a commit, and can no longer be withdrawn | committed, proposed, done |
 | proposed | awaits a person's approval | proposed, queued, withdrawn, done |
-| withdrawn | was taken back, released or replaced | done |
+| withdrawn | was taken back, given up, released or replaced | done |
 | done | is answered | |
 
 A method that changes a state holds one lock while it writes to the journal, changes the state and
@@ -22,12 +22,14 @@ import logging
 from collections import Counter, OrderedDict, deque
 from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import replace
+from datetime import datetime
+from operator import attrgetter
 
 from demandops.base import errors
 from demandops.base.errors import DemandOpsError, InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
-from demandops.serve.journal import Journal, ProposalRecord, Receipt, State, Ticket
+from demandops.serve.journal import Journal, ProposalRecord, Receipt, Ticket, TicketState
 
 log = logging.getLogger("demandops")
 
@@ -40,6 +42,7 @@ log = logging.getLogger("demandops")
 # - A rollback or a decommission may touch any subject, so it overtakes no demand, and no demand
 #   overtakes it.
 
+_NUMBER = attrgetter("number")
 _Line = OrderedDict[Ticket, None]  # a set in order, which loses any member at once
 
 
@@ -97,30 +100,72 @@ class FairQueue:
     def popleft(self) -> Ticket:
         requester, lane = next(iter(self._lanes.items()))
         self._lanes.move_to_end(requester)  # so that the other requesters come first
-        first = next(iter(lane))
+        before, first = next(iter(lane)), None
         # whoever has the turn, related demands leave in the order in which they came
-        while (predecessor := self._predecessor(first)) is not None:
-            first = predecessor
-        self.remove([first])
-        return first
+        while before is not first:
+            first = before
+            lines = [self._queued]
+            if first.subjects is not None:
+                touched = (*first.subjects, None)
+                lines = [self._subjects[each] for each in touched if each in self._subjects]
+            before = min([first, *(next(iter(line)) for line in lines)], key=_NUMBER)
+        self.remove([before])
+        return before
 
     def _places(self, ticket: Ticket) -> list[tuple[dict[Hashable, _Line], Hashable]]:
         subjects = (None,) if ticket.subjects is None else ticket.subjects
         lane = "" if self._in_order else ticket.requester
         return [(self._lanes, lane), *((self._subjects, subject) for subject in subjects)]
 
-    def _predecessor(self, ticket: Ticket) -> Ticket | None:
-        if ticket.subjects is None:
-            oldest = next(iter(self._queued))
-            return oldest if oldest is not ticket else None
-        if None in self._subjects:
-            first = next(iter(self._subjects[None]))
-            if first.number < ticket.number:
-                return first
-        for subject in ticket.subjects:
-            if (first := next(iter(self._subjects[subject]))) is not ticket:
-                return first
-        return None
+
+# ---- whether the remote can be reached, for logs, diagnostics and refusals ----
+
+
+class Remote:
+    # any thread may read the fields
+
+    unreachable = ""  # why the remote cannot be read or written now
+    push_denied = ""  # why the remote, which can be read, takes no push
+    unreachable_since: datetime | None = None
+    last_reached: datetime | None = None
+    last_push: datetime | None = None
+    # by the monotonic clock, as a person may set the other one
+    _away_from = _denied_from = 0.0
+
+    def __init__(self, address: str, runtime: Runtime) -> None:
+        self._address, self._runtime = address, runtime
+
+    @property
+    def blocked(self) -> str:
+        return self.unreachable or self.push_denied
+
+    def record_reached(self, *, pushed: bool = False) -> None:
+        self.last_reached = self._runtime.now()
+        if self.unreachable:
+            away = self._runtime.monotonic() - self._away_from
+            log.info("%s is back after %.0f s", self._address, away)
+            self.unreachable, self.unreachable_since = "", None
+        if pushed:
+            self.push_denied, self.last_push = "", self.last_reached
+
+    def record_failure(self, reason: str, *, is_denied: bool = False) -> float:
+        """Return for how many seconds the remote, which can be read, has denied all pushes."""
+        now, known = self._runtime.monotonic(), self.unreachable
+        if is_denied:
+            self.record_reached()
+            known, self.push_denied = self.push_denied, reason
+            self._denied_from = self._denied_from if known else now
+        else:
+            self._away_from = self._away_from if known else now
+            self.unreachable_since = self.unreachable_since or self._runtime.now()
+            self.unreachable = reason
+        if known:
+            log.debug("%s", reason)
+        elif is_denied:
+            log.error("%s", reason)
+        else:
+            log.warning("%s; trying again until the state repo is back", reason)
+        return now - self._denied_from if is_denied else 0.0
 
 
 # ---- the states of the demands ----
@@ -130,7 +175,7 @@ GIVEN_UP = "the demand was given up by `demandops journal --drop`"
 # The seconds between two looks for such requests.
 _LOOK_S = 1.0
 
-_NEXT: dict[State, tuple[State, ...]] = {
+_NEXT: dict[TicketState, tuple[TicketState, ...]] = {
     "arrived": ("queued", "done"),
     "queued": ("committed", "proposed", "withdrawn", "done"),
     "committed": ("committed", "proposed", "done"),
@@ -142,9 +187,14 @@ _NEXT: dict[State, tuple[State, ...]] = {
 
 class Demands:
     def __init__(
-        self, journal: Journal, limit: int, requester_limit: int | None, runtime: Runtime
+        self,
+        journal: Journal,
+        limit: int,
+        requester_limit: int | None,
+        remote: Remote,
+        runtime: Runtime,
     ) -> None:
-        self._journal = journal
+        self._journal, self.remote = journal, remote
         # The limit of a requester does not count demands that await approval: a person takes days.
         self._limit, self._requester_limit = limit, requester_limit
         self._of_requester = Counter[str]()
@@ -157,11 +207,7 @@ class Demands:
             log.info("resuming demand %s from the journal", ticket.operation)
             if ticket.proposal is None:
                 self._enqueue(ticket)
-        self._taken_back: list[Ticket] = []
         self.is_closed = self._woken = False
-        # Why no demand can be published now, or empty. QueueFull quotes it: a queue that is full
-        # behind a remote that is away needs another remedy than a client that sends too much.
-        self.blocked = ""
         self._give_up_what_is_dropped()  # before the worker begins
 
     # ---- queries ----
@@ -222,6 +268,7 @@ class Demands:
         with self._changed:
             self._journal.require_sound()
             self._new.clear()
+            batch[:] = [ticket for ticket in batch if ticket.state != "done"]
             room = min(limit - len(batch), len(self._queue))
             batch += [self._queue.popleft() for _ in range(room)]
 
@@ -229,9 +276,7 @@ class Demands:
         # The next batch takes turns between these demands and those that others sent meanwhile. The
         # requesters of ``served``, the demands that were evaluated, come last.
         with self._changed:
-            # `answer_withdrawn` answers the withdrawn ones
-            left = [ticket for ticket in batch if ticket not in self._taken_back]
-            self._queue.put_back(left, served)
+            self._queue.put_back([each for each in batch if each.state != "done"], served)
             batch.clear()
 
     # ---- changes of state ----
@@ -253,31 +298,50 @@ class Demands:
             self._take_in()
             self._give_up_what_is_dropped()
 
-    def _take_in(self) -> None:
+    def _take_in(self) -> None:  # noqa: PLR0912
         if not self._arrived:
             return
         taken, refused = dict[str, Ticket](), list[tuple[Ticket, DemandOpsError]]()
         with self._changed:
             for _ in range(len(self._arrived)):
                 ticket = self._arrived.popleft()
-                if (error := self._why_refused(ticket, taken)) is not None:
-                    refused.append((ticket, error))
-                    continue
-                self._of_requester[ticket.requester] += 1
-                taken[ticket.operation] = ticket
+                who, operation = ticket.requester, ticket.operation
+                if self.is_closed:
+                    why = "the generator is shutting down; send the demand again later"
+                    refused.append((ticket, errors.ShuttingDown(why)))
+                # those taken just before are not queued yet
+                elif len(taken) + len(self._queue) >= self._limit:
+                    blocked = self.remote.blocked
+                    # this needs another remedy than a client that sends too much
+                    why = f" and cannot be published ({blocked})" if blocked else ""
+                    why = f"{self._limit} demands are queued already{why}; "
+                    refused.append((ticket, errors.QueueFull(f"{why}send the demand again later")))
+                elif operation in self._journal.pending or operation in taken:
+                    why = f"'{operation}' is the operation id of another demand; choose a new one"
+                    refused.append((ticket, errors.Refused([errors.fault("", why)])))
+                elif self._requester_limit is not None and (
+                    self._of_requester[who] >= self._requester_limit
+                ):
+                    whose = f"of {quoted(who)}" if who else "without a requester"
+                    why = f"{self._requester_limit} demands {whose} have no answer yet; send the "
+                    why += "demand again later, or raise the node's parameter requester_queue_limit"
+                    refused.append((ticket, errors.QueueFull(why)))
+                else:
+                    self._of_requester[who] += 1
+                    taken[operation] = ticket
             try:
                 self._journal.append(taken.values())
             except Exception as failure:
                 if isinstance(failure, DemandOpsError):
-                    why = failure
-                    log.error("%s", why)
+                    error = failure
+                    log.error("%s", error)
                 else:  # a bug must leave no demand without an answer
-                    why = errors.internal(failure)
+                    error = errors.internal(failure)
                     log.exception("internal error while journaling demands")
                 self.wake()  # so that the worker ends the process if the journal is unsound
                 for ticket in taken.values():
                     self._of_requester[ticket.requester] -= 1
-                    refused.append((ticket, why))
+                    refused.append((ticket, error))
                 taken = {}
             for ticket in taken.values():
                 _change(ticket, "queued")
@@ -288,28 +352,6 @@ class Demands:
             ticket.journaled.set_result(True)
         for ticket, error in refused:
             ticket.refuse(error)
-
-    def _why_refused(self, ticket: Ticket, others: dict[str, Ticket]) -> DemandOpsError | None:
-        if self.is_closed:
-            why = "the generator is shutting down; send the demand again later"
-            return errors.ShuttingDown(why)
-        # the others were accepted just before, and are not queued yet
-        if len(others) + len(self._queue) >= self._limit:
-            why = f" and cannot be published ({self.blocked})" if self.blocked else ""
-            return errors.QueueFull(
-                f"{self._limit} demands are queued already{why}; send the demand again later"
-            )
-        if ticket.operation in self._journal.pending or ticket.operation in others:
-            message = "is the operation id of another demand; choose a new one"
-            return errors.Refused([errors.fault("", f"'{ticket.operation}' {message}")])
-        who = ticket.requester
-        if (limit := self._requester_limit) is not None and self._of_requester[who] >= limit:
-            whose = f"of {quoted(who)}" if who else "without a requester"
-            return errors.QueueFull(
-                f"{limit} demands {whose} have no answer yet; send the demand again "
-                "later, or raise the node's parameter requester_queue_limit"
-            )
-        return None
 
     def commit(self, ticket: Ticket) -> bool:
         with self._changed:
@@ -323,7 +365,7 @@ class Demands:
             was_proposed = ticket.proposal is not None
             self._note(ticket, record)
             if not was_proposed:
-                self._leave(ticket)
+                self._of_requester -= Counter([ticket.requester])
             return _change(ticket, "proposed")
 
     def _note(self, ticket: Ticket, proposal: ProposalRecord | None) -> None:
@@ -346,10 +388,10 @@ class Demands:
     def withdraw(self, operation: str) -> bool:
         self._take_in()
         with self._changed:
-            tickets = {ticket.operation: ticket for ticket in self._taken_back}
-            ticket = self._journal.pending.get(operation) or tickets.get(operation)
+            ticket = self._journal.pending.get(operation)
             if ticket is None or "withdrawn" not in _NEXT[ticket.state]:
                 return ticket is not None and ticket.state == "withdrawn"
+            awaits_approval = ticket.proposal is not None
             try:
                 self._withdraw(ticket, TAKEN_BACK)
             # if unsound, the worker ends the process
@@ -357,6 +399,8 @@ class Demands:
                 log.error("demand %s cannot be withdrawn: %s", operation, error)
                 self.wake()
                 return False
+        if not awaits_approval:  # else it is answered after its branch is deleted
+            self.answer([(ticket, errors.Withdrawn(TAKEN_BACK))])
         return True
 
     def _give_up_what_is_dropped(self) -> None:
@@ -365,13 +409,18 @@ class Demands:
                 ticket = self._journal.pending.get(request.name.partition("-")[2])
                 if ticket is None:  # it is answered
                     request.unlink()
-                elif ticket.state != "withdrawn":
-                    log.warning("%s: demand %s", GIVEN_UP, ticket.operation)
-                    # a push of a committed demand may have arrived, so the next attempt answers it
-                    if ticket.state == "committed":
-                        ticket.state, ticket.withdrawn = "withdrawn", GIVEN_UP
-                    else:
-                        self._withdraw(ticket, GIVEN_UP)
+                    continue
+                if ticket.withdrawn:
+                    continue
+                log.warning("%s: demand %s", GIVEN_UP, ticket.operation)
+                # a push of a committed demand may have arrived, so the next attempt answers it
+                if ticket.state == "committed":
+                    ticket.state, ticket.withdrawn = "withdrawn", GIVEN_UP
+                    continue
+                awaits_approval = ticket.proposal is not None
+                self._withdraw(ticket, GIVEN_UP)
+            if not awaits_approval:
+                self.answer([(ticket, errors.Withdrawn(GIVEN_UP))])
 
     def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
         with self._changed:
@@ -383,22 +432,12 @@ class Demands:
         if ticket.proposal is None:
             # a restart must not resume the withdrawn demand
             self._journal.mark_done([ticket.operation], durably=True)
-            self._taken_back.append(ticket)
-            ticket.withdrawn = reason
+            self._queue.remove([ticket])
         else:  # the demand stays in the journal until its branch is deleted
             self._note(ticket, replace(ticket.proposal, withdrawn=reason))
+            self.wake()
+        ticket.withdrawn = reason
         _change(ticket, "withdrawn")
-        self.wake()  # the worker answers the demand even while nothing can be published
-
-    def answer_withdrawn(self, batch: list[Ticket]) -> None:
-        # those that were withdrawn while proposed are answered after their branch is deleted
-        with self._changed:
-            withdrawn, self._taken_back = self._taken_back, []
-            if not withdrawn:
-                return
-            self._queue.remove(withdrawn)
-            batch[:] = [ticket for ticket in batch if ticket not in withdrawn]
-        self.answer((ticket, errors.Withdrawn(ticket.withdrawn)) for ticket in withdrawn)
 
     def answer(
         self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
@@ -439,7 +478,8 @@ class Demands:
                 # a proposed demand left the count of its requester already, and the end of a lease
                 # was never in it
                 if ticket.demand.operation != "expire" and ticket.proposal is None:
-                    self._leave(ticket)
+                    # it drops a requester at 0, so that passing vehicles leave nothing behind
+                    self._of_requester -= Counter([ticket.requester])
         for ticket, result in results:
             if isinstance(result, Receipt):
                 ticket.notify("pushed", f"pushed {result.commit}")
@@ -453,19 +493,15 @@ class Demands:
     def end(self, error: errors.Unsound) -> None:
         self.close()
         with self._changed:
-            left = [*self._journal.pending.values(), *self._taken_back]
+            left = [*self._journal.pending.values()]
         self.fail(left, error, keep=True)
 
     def _enqueue(self, ticket: Ticket) -> None:
         self._of_requester[ticket.requester] += 1
         self._queue.append(ticket)
 
-    def _leave(self, ticket: Ticket) -> None:
-        # this difference drops a requester at 0, so that passing vehicles leave nothing behind
-        self._of_requester -= Counter([ticket.requester])
 
-
-def _change(ticket: Ticket, state: State) -> bool:
+def _change(ticket: Ticket, state: TicketState) -> bool:
     if state in _NEXT[ticket.state]:
         ticket.state = state
     return ticket.state == state

@@ -14,18 +14,17 @@ from demandops.base.runtime import REAL, Runtime
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import read_goal
-from demandops.repo.git.remote_repository import connect
+from demandops.repo.git.remote_repository import Slot, connect
 from demandops.repo.git.repository import access_error, reading
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Progress, Snapshot
-from demandops.repo.slot import Slot
 from demandops.serve.agenda import heartbeat_in
 from demandops.serve.approvals import Approvals
-from demandops.serve.demands import Demands
+from demandops.serve.demands import Demands, Remote
 from demandops.serve.journal import Listener, Ticket, open_journal
-from demandops.serve.worker import RemoteStatus, Worker
+from demandops.serve.worker import Worker
 
 log = logging.getLogger("demandops")
 
@@ -93,7 +92,8 @@ class Generator:
             raise
         self._repository, self._runtime = repository, runtime
         self.address = repository.address
-        self._demands = Demands(self._journal, queue_limit, requester_limit, runtime)
+        self.remote_status = remote = Remote(self.address, runtime)
+        self._demands = Demands(self._journal, queue_limit, requester_limit, remote, runtime)
         token_file = settings.forge_token_file()
         self._worker = Worker(
             repository,
@@ -126,10 +126,6 @@ class Generator:
             return snapshots.state_at(objects, commit.id)
 
     @property
-    def remote_status(self) -> RemoteStatus:
-        return self._worker.remote.status
-
-    @property
     def unpublished(self) -> int:
         return self._demands.unpublished
 
@@ -151,7 +147,7 @@ class Generator:
         ``StateRepoError``, and its listener is not called. If the generator ends before the demand
         is published or approved, the error is ``ShuttingDown`` or ``Unsound``, and the next start
         resumes the demand. ``operation`` is an id that no other demand ever had. ``listener`` is
-        called in the worker thread.
+        called in the worker thread, and of a demand that is given up in another one.
         """
         operation = operation or self._runtime.fresh_id()
         if not _OPERATION.fullmatch(operation):

@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -18,13 +18,15 @@ from typing import Any, Literal
 from demandops.base.errors import DemandOpsError, Refused, StateRepoError, Unsound
 from demandops.base.quoting import quoted
 from demandops.cluster.health import Target
-from demandops.decide.decision import Outcome
+from demandops.cluster.rollouts import targets_of_decision
+from demandops.decide.decision import Decision, Outcome
+from demandops.decide.state import State
 from demandops.model.demand.demand import UNSTARTED, Demand
 from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo.git.objects import sync_folder
+from demandops.repo.git.remote_repository import lock
 from demandops.repo.git.repository import disk_error
-from demandops.repo.slot import lock
 
 log = logging.getLogger("demandops")
 
@@ -46,7 +48,7 @@ Stage = Literal[
 Listener = Callable[[Stage, str], None]
 
 # Only :class:`demands.Demands` changes the state of a demand.
-State = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done"]
+TicketState = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +65,23 @@ class Receipt:
     lease_s: int | None = None
     targets: tuple[Target, ...] = ()  # the releases to follow, if the generator was asked for them
     changes: tuple[ClaimChange, ...] = ()
+
+    @classmethod
+    def of(
+        cls, operation: str, decision: Decision, commit: str, before: State, with_targets: bool
+    ) -> Receipt:
+        return cls(
+            operation,
+            decision.request.id,
+            decision.outcome,
+            commit,
+            warnings=decision.warnings,
+            not_held=decision.changes.not_held,
+            placed=decision.placed,
+            lease_s=decision.lease_s,
+            targets=targets_of_decision(before, decision) if with_targets else (),
+            changes=decision.changes.claims,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,13 +121,13 @@ class Ticket:
     # Whether this demand released one that awaited approval: then it succeeds even if it ends no
     # claim.
     has_released: bool = False
-    state: State = "queued"
+    state: TicketState = "queued"
     # while it is in the queue: its place in the order of arrival, and what it touches (None: any)
     number: int = 0
     subjects: frozenset[Hashable] | None = None
     notified: set[str] = field(default_factory=set)
     unread: Refused | None = None  # why its goal in the journal cannot be read
-    withdrawn: str = ""  # the reason, if it awaited no approval
+    withdrawn: str = ""  # the reason, if it is
 
     def __post_init__(self) -> None:
         for future in (self.future, self.journaled):
@@ -172,7 +191,8 @@ class Ticket:
         if proposal is not None:
             commits = tuple(proposal["commits"])
             ticket.proposal = ProposalRecord(**{**proposal, "commits": commits})
-            ticket.state = "withdrawn" if ticket.proposal.withdrawn else "proposed"
+            ticket.withdrawn = ticket.proposal.withdrawn
+            ticket.state = "withdrawn" if ticket.withdrawn else "proposed"
         return ticket
 
     def tell_the_log(self, stage: Stage, text: str) -> None:
@@ -218,9 +238,11 @@ class Journal:
         self._unsound: Unsound | None = None
         self.pending = read(path)
         self._chain, self._size, self._limit, self._is_broken = "", 0, 0, True
-        with self._explained("try again"):
+        try:
             self._file = path.open("ab", buffering=0)
             self._rewrite()
+        except OSError as error:
+            raise self._unwritten(error, "try again") from None
 
     def drop_requests(self) -> list[Path]:
         with suppress(OSError):  # the next look tries again
@@ -236,10 +258,8 @@ class Journal:
 
         Unsound is raised if nobody knows whether they are written.
         """
-        tickets = list(tickets)
-        if tickets:
-            with self._explained():
-                self._write([ticket.as_data() for ticket in tickets], durably=True)
+        if tickets := list(tickets):
+            self._write([ticket.as_data() for ticket in tickets], durably=True)
             self.pending.update((ticket.operation, ticket) for ticket in tickets)
 
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
@@ -250,17 +270,16 @@ class Journal:
         done = [operation for operation in dict.fromkeys(operations) if operation in self.pending]
         records = [{"done": operation} for operation in done]
         if durably and done:
-            with self._explained():
-                self._write(records, durably=True)
+            self._write(records, durably=True)
         for operation in done:
             del self.pending[operation]
         if done and not durably:
-            with suppress(OSError):
+            with suppress(StateRepoError):
                 self._write(records, durably=False)
 
     def close(self) -> None:
         # if this fails, the next process may evaluate again a demand that is done
-        with suppress(OSError, Unsound):
+        with suppress(StateRepoError, Unsound):
             self._write([], durably=True)
         self._file.close()
 
@@ -269,8 +288,11 @@ class Journal:
         if self._size > self._limit:
             with suppress(OSError):  # the next write tries again
                 self._rewrite()
-        if self._is_broken:
-            self._rewrite()
+        try:
+            if self._is_broken:
+                self._rewrite()
+        except OSError as error:
+            raise self._unwritten(error) from None
         text, chain = _sealed(records, self._chain)
         self._is_broken = True
         try:
@@ -280,7 +302,7 @@ class Journal:
             if durably:
                 os.fdatasync(self._file.fileno())
         except OSError as error:
-            self._require_known(error)
+            unwritten = self._unwritten(error)
             try:
                 self._file.truncate(self._size)
             except OSError:  # a restart could read demands that this process refuses
@@ -289,7 +311,7 @@ class Journal:
                     "check its disk, then start again"
                 )
                 self.require_sound()
-            raise
+            raise unwritten from None
         self._is_broken, self._chain, self._size = False, chain, self._size + len(text)
 
     def _rewrite(self) -> None:
@@ -314,22 +336,15 @@ class Journal:
         # so that rewriting costs no more than what was appended
         self._limit = max(_MOST_BYTES, 2 * len(text))
 
-    def _require_known(self, error: OSError) -> None:
+    def _unwritten(self, error: OSError, remedy: str = "send the demand again") -> StateRepoError:
         reason = disk_error(error, f"the journal {self._path}")
-        if isinstance(reason, Unsound):
+        if isinstance(reason, Unsound):  # nobody knows what is on the disk
             self._unsound = reason
             raise reason from None
-
-    @contextmanager
-    def _explained(self, remedy: str = "send the demand again") -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            self._require_known(error)
-            raise StateRepoError(
-                f"the journal {self._path} cannot be written: {error.strerror or error}; check its "
-                f"disk, then {remedy}"
-            ) from None
+        return StateRepoError(
+            f"the journal {self._path} cannot be written: {error.strerror or error}; check its "
+            f"disk, then {remedy}"
+        )
 
 
 def read(path: Path) -> dict[str, Ticket]:

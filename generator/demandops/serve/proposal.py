@@ -101,8 +101,8 @@ class Proposal:
                 )
             if ticket.operation in on_main or is_merged:
                 verdict.booked.append((ticket, decision))
-            elif ticket.state == "withdrawn" and ticket.proposal:
-                verdict.failed.append((ticket, Withdrawn(ticket.proposal.withdrawn)))
+            elif ticket.withdrawn:
+                verdict.failed.append((ticket, Withdrawn(ticket.withdrawn)))
             elif isinstance(decision, InvalidInput):
                 verdict.failed.append((ticket, decision))
             elif decision.approval:

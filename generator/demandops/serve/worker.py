@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from datetime import datetime
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from math import inf
 
 from demandops.base import errors
 from demandops.base.errors import DemandOpsError, StateRepoError
-from demandops.base.runtime import Runtime
 from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.model.config.config import Config
@@ -27,70 +25,12 @@ from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve import agenda
 from demandops.serve.agenda import Agenda, Backoff, RateLimit, What
 from demandops.serve.approvals import Approvals, Result, commit_without_files
-from demandops.serve.demands import TAKEN_BACK, Demands
+from demandops.serve.demands import Demands
 from demandops.serve.journal import Receipt, Ticket
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 log = logging.getLogger("demandops")
 
-# ---- whether the remote can be reached, for logs and diagnostics ----
-
-
-@dataclass(frozen=True, slots=True)
-class RemoteStatus:
-    unreachable: str = ""  # why the remote cannot be read or written now
-    push_denied: str = ""  # why the remote, which can be read, takes no push
-    unreachable_since: datetime | None = None
-    last_reached: datetime | None = None
-    last_push: datetime | None = None
-
-    @property
-    def blocked(self) -> str:
-        return self.unreachable or self.push_denied
-
-
-class RemoteMonitor:
-    # any thread may read ``status``
-    def __init__(self, address: str, runtime: Runtime) -> None:
-        self._address, self._runtime = address, runtime
-        self.status = RemoteStatus()
-        self._away_from = self._denied_from = 0.0
-
-    def record_reached(self, *, pushed: bool = False) -> None:
-        now, before = self._runtime.now(), self.status
-        if before.unreachable_since is not None:
-            away = self._runtime.monotonic() - self._away_from
-            log.info("%s is back after %.0f s", self._address, away)
-        self.status = RemoteStatus(
-            push_denied="" if pushed else before.push_denied,
-            last_reached=now,
-            last_push=now if pushed else before.last_push,
-        )
-
-    def record_failure(self, reason: str, *, is_denied: bool = False) -> float:
-        """Return for how many seconds the remote, which can be read, has denied all pushes."""
-        now, before = self._runtime.monotonic(), self.status
-        if is_denied:
-            self.record_reached()
-            self.status = replace(self.status, push_denied=reason)
-            if before.push_denied:
-                log.debug("%s", reason)
-            else:
-                log.error("%s", reason)
-                self._denied_from = now
-            return now - self._denied_from
-        if before.unreachable_since is None:
-            log.warning("%s; trying again until the state repo is back", reason)
-            self._away_from = now  # as a person may set the other clock
-        else:
-            log.debug("%s", reason)
-        since = before.unreachable_since or self._runtime.now()
-        self.status = replace(before, unreachable=reason, unreachable_since=since)
-        return 0.0
-
-
-# ---- the worker ----
-#
 # The worker runs in one thread, the only one that writes to the state repo. Demands go first, so a
 # fetch stops when a demand arrives. The push of the demand finds new commits just as the fetch
 # would.
@@ -99,9 +39,6 @@ class RemoteMonitor:
 _TIDY_EVERY = 50
 # How often to carry out a change by a person while other generators, which do the same, are faster.
 _TRIES = 5
-# How many times the duration of a judgement passes before a configuration that is not in effect is
-# judged again because claims have ended: each renders all releases.
-_JUDGING_PAUSE_FACTOR = 20
 # How often a demand's commit must be refused alone, while another commit is accepted in between,
 # before it counts as refused: with a verdict of the server, and without one, as the connection may
 # have failed.
@@ -125,7 +62,7 @@ class Worker:
     ) -> None:
         self.snapshot = snapshot
         self.listeners: list[Callable[[Config], None]] = []
-        self.remote = RemoteMonitor(repository.address, repository.runtime)
+        self.remote = demands.remote
         self._repository, self._demands, self._approvals = repository, demands, approvals
         self._runtime = repository.runtime
         self._heartbeat = repository.while_waiting = heartbeat
@@ -133,7 +70,7 @@ class Worker:
         self._agenda = Agenda(fetch_interval, self._runtime, local=repository.on_this_disk)
         self._batch_limit = agenda.LIMIT_LOCAL if repository.always_current else agenda.LIMIT_REMOTE
         self._backoff = Backoff(self._batch_limit, self._runtime)
-        self._must_fetch = self._tip_is_fresh = False
+        self._tip_is_fresh = False
         self._refusal_patience_s = refusal_patience_s
         # the demand whose commit was refused alone, how often, and whether another was accepted
         self._suspect: Demand | None = None
@@ -142,7 +79,6 @@ class Worker:
         self._leaves_due_work = False
         self._packs_since_tidy = 0
         self._logged: tuple[errors.Fault, ...] = ()
-        self._must_judge, self._judge_at = False, 0.0
         # what a refused demand is told while the configuration of main is not in effect
         self._not_in_effect = ""
         self._warned_of_signers = False
@@ -168,14 +104,10 @@ class Worker:
             # people may have decided about proposals before the start: answer these demands first
             if self._demands.proposed:
                 self._work()
-            while self._demands.wait(min(*self._due_in().values(), self._seconds_until_judging)):
+            while self._demands.wait(min(self._due_in().values())):
                 self._heartbeat()
                 self._work()
         self._approvals.suspend()
-
-    @property
-    def _seconds_until_judging(self) -> float:
-        return max(0.0, self._judge_at - self._runtime.monotonic()) if self._must_judge else inf
 
     def _due_in(self, *, has_news: bool = False) -> dict[What, float]:
         main = str(self.snapshot.commit) if self._approvals.proposals else ""
@@ -190,11 +122,11 @@ class Worker:
                 self._publish(batch)
             elif not self._agenda.waits_s("all"):
                 self._follow()
-            if self._must_judge and not self._seconds_until_judging:
-                self._must_judge, began = False, self._runtime.monotonic()
+            if self._agenda.must_judge and not self._due_in()["judge"]:
+                began = self._runtime.monotonic()
+                self._agenda.must_judge = False
                 self._try_to_carry_out_changes(again=True)
-                end = self._runtime.monotonic()
-                self._judge_at = end + _JUDGING_PAUSE_FACTOR * (end - began)
+                self._agenda.judged(began)
             if self._packs_since_tidy >= _TIDY_EVERY:
                 self._packs_since_tidy = 0
                 self._repository.tidy()
@@ -231,14 +163,15 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         # also the demands that arrive during retries, and the ends of leases; the batch is empty
         # afterwards, unless an error is raised
-        self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
+        must_fetch = bool(self.remote.unreachable)
+        self._tip_is_fresh = self._repository.always_current
         self._suspect, self._leaves_due_work = None, False
         self._backoff.begin_anew()
         while batch or self._ended_leases(self.snapshot):
             self._heartbeat()
             self._require_not_ending()
             try:
-                wait = self._attempt(batch)
+                wait = self._attempt(batch, must_fetch)
             except Exception as failure:
                 reason = access_error(failure, self._repository.address, self._repository.objects)
                 if not isinstance(reason, Unavailable | PushDenied):
@@ -247,7 +180,6 @@ class Worker:
                 for ticket in batch:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
                 patience_s = self._refusal_patience_s - self._record_failure(reason)
-                self._tip_is_fresh = self._repository.always_current
                 wait = self._backoff.unreachable()
                 if isinstance(reason, Unavailable):
                     wait = max(wait, reason.retry_after_s)
@@ -257,16 +189,16 @@ class Worker:
                     self._demands.fail(batch, reason)
                     batch.clear()
                     return
-            if wait is None:
+            # fetch before a demand is committed, because after that it can no longer be withdrawn
+            if not (must_fetch := wait is not None):
                 continue
             # Wait before the fetch, not after it, because the push must follow the fetch closely.
-            # Meanwhile answer withdrawn demands, and tell the others what they wait for.
+            # Meanwhile tell the demands what they wait for.
             end, to_notify = self._runtime.monotonic() + wait, list(batch)
             while not self._ends_soon.is_set():
-                blocked = self.remote.status.blocked
+                blocked = self.remote.blocked
                 for ticket in to_notify if blocked else ():
                     ticket.notify("away", f"waiting: {blocked}")
-                self._demands.answer_withdrawn(batch)
                 seconds = end - self._runtime.monotonic()
                 if seconds <= 0:
                     break
@@ -276,18 +208,16 @@ class Worker:
 
     def _require_not_ending(self) -> None:
         if self._ends_soon.is_set():
-            reason = self._demands.blocked or "the generator stops"
+            reason = self.remote.blocked or "the generator stops"
             raise errors.ShuttingDown(
                 f"{reason}; the demand stays in the journal and is resumed at the next start"
             )
 
-    def _attempt(self, batch: list[Ticket]) -> float | None:  # noqa: PLR0912
+    def _attempt(self, batch: list[Ticket], must_fetch: bool) -> float | None:  # noqa: PLR0912
         # the seconds to wait before the next attempt, or None to continue at once
-        # fetch before a demand is committed, because after that it can no longer be withdrawn
-        if self._must_fetch or self.remote.status.unreachable:
+        if must_fetch:
             self._repository.refresh()
-            self._must_fetch, self._tip_is_fresh = False, True
-        self._demands.answer_withdrawn(batch)
+            self._tip_is_fresh = True
         tip = self._repository.tip()
         results = self._published_before(str(tip), batch)
         booked = {ticket for ticket, _ in results}
@@ -327,6 +257,8 @@ class Worker:
                 return None
         try:
             published = self._publish_commits(commits, results)
+            if commits.is_empty:  # so the tip is fresh
+                self._record_reached()
         except PushDenied as refusal:
             # what was decided before the batch had a commit does not depend on the push
             self._answer(results[:independent])
@@ -343,7 +275,6 @@ class Worker:
         log.info("another writer was first; evaluating %d demands again", len(results))
         for ticket in part:
             ticket.mark_maybe_published(str(commits.start.commit))
-        self._must_fetch = True
         return self._backoff.overtaken(
             len(results), evaluated - began, self._runtime.monotonic() - evaluated
         )
@@ -362,8 +293,8 @@ class Worker:
         # A demand that needs approval gets no commit; its result is the decision. A receipt is true
         # only once the batch is published. Errors that concern all demands are raised; others leave
         # the rest of the batch alone.
-        if ticket.state == "withdrawn":
-            return errors.Withdrawn(ticket.withdrawn or TAKEN_BACK)
+        if ticket.withdrawn:
+            return errors.Withdrawn(ticket.withdrawn)
         if ticket.unread is not None:
             return ticket.unread
         try:
@@ -396,7 +327,7 @@ class Worker:
                 return decision
             # from here on the demand can no longer be taken back
             if not self._demands.commit(ticket):
-                return errors.Withdrawn(ticket.withdrawn or TAKEN_BACK)
+                return errors.Withdrawn(ticket.withdrawn)
             if decision.request.operation == "put":
                 self._approvals.withdraw_replaced(decision.request)
             if decision.outcome == "waiting":
@@ -409,7 +340,9 @@ class Worker:
                 waits = decision.outcome == "waiting"  # the demand waited already
                 commits.record_in_next_commit(ticket.operation, "waiting" if waits else "unchanged")
                 commit = str(commits.head.commit)
-            return self._approvals.receipt(ticket, decision, commit, state)
+            return Receipt.of(
+                ticket.operation, decision, commit, state, self._approvals.with_targets
+            )
         except errors.InvalidInput as error:
             if ticket.has_released:  # the demand released a proposal, which had no claims yet
                 commits.record_in_next_commit(ticket.operation, "released")
@@ -477,14 +410,15 @@ class Worker:
             return []
         return self._agenda.lease_tickets(snapshot.state.ledger)
 
-    def _publish_commits(self, commits: CommitBatch, results: list[Result]) -> bool:
+    def _publish_commits(self, commits: CommitBatch, results: Iterable[Result] = ()) -> bool:
         # false, without answers, if another writer was first or locks main
         if not commits.publish():
             return False
-        self._record_reached(pushed=not commits.is_empty)
+        if not commits.is_empty:
+            self._record_reached(pushed=True)
+            self._is_writer_proven = True
         self._record_published(commits)
-        self._is_writer_proven = self._is_writer_proven or not commits.is_empty
-        self._answer(results)
+        self._answer(list(results))
         return True
 
     def _answer(self, results: list[Result]) -> None:
@@ -532,7 +466,7 @@ class Worker:
             now = self._runtime.now()
             title, why = "Check that the server takes commits", "Why: it refused another commit."
             commit_without_files(commits, [[title], [why]], [("Operation", "follow")], now)
-        self._must_fetch = not self._publish_commits(commits, [])
+        self._publish_commits(commits)
         return None
 
     # ---- following the state repo ----
@@ -551,7 +485,9 @@ class Worker:
             elif not (self._repository.always_current or is_due):
                 return
             new = is_due or self._repository.tip() != self.snapshot.commit
-            self._record_reached(pushed=new and self._carry_out_changes())
+            self._record_reached()
+            if new:
+                self._carry_out_changes()
         except repositories.FetchInterrupted:
             self._agenda.wants_fetch.set()  # it is still due
         except StateRepoError as error:
@@ -569,15 +505,10 @@ class Worker:
                 self._try_to_carry_out_changes()
             # a deleted branch may have been merged, which only a main as new as ``heads`` shows
             if self._repository.includes(str(self.snapshot.commit), heads.main):
-                self._approvals.check(self.snapshot, heads, self._publish_record)
+                self._approvals.check(self.snapshot, heads, self._publish_commits)
                 self._agenda.checked(str(self.snapshot.commit))
         except (Unavailable, PushDenied) as error:
             log.warning("%s; the demands that await approval keep waiting", error)
-
-    def _publish_record(self, commits: CommitBatch) -> bool:
-        if is_published := commits.publish():
-            self._record_published(commits)
-        return is_published
 
     def _try_to_carry_out_changes(self, *, again: bool = False) -> None:
         try:
@@ -585,20 +516,17 @@ class Worker:
         except StateRepoError as error:
             self._record_failure(error)
 
-    def _carry_out_changes(self, *, again: bool = False) -> bool:
-        """Publish the effects of people's changes; return whether a commit was published."""
-        # the caller has fetched the changes
+    def _carry_out_changes(self, *, again: bool = False) -> None:
+        # publishes the effects of people's changes, which the caller has fetched
         self._leaves_due_work = False
         for _ in range(_TRIES):
-            commits = self._new_commit_batch(again=again)
-            if self._publish_record(commits):
-                return not commits.is_empty
+            if self._publish_commits(self._new_commit_batch(again=again)):
+                return
             self._repository.refresh()
             # at random, so that generators which all saw the change do not collide again
             self._ends_soon.wait(self._runtime.uniform(0, 0.05))
         # other generators are faster, and they carry out the same changes
         self._agenda.failed("own work")
-        return False
 
     def _new_commit_batch(self, *, again: bool = False) -> CommitBatch:
         # its first commits render people's changes, and do the own work that is due
@@ -649,7 +577,7 @@ class Worker:
         before, self.snapshot = self.snapshot, commits.head
         # without a claim or an override that has ended, the configuration of main may be valid
         if self.snapshot.state.ledger is not commits.start.state.ledger:
-            self._must_judge = bool(self.snapshot.faults)
+            self._agenda.must_judge = bool(self.snapshot.faults)
         # also true after a person's merge that needs no commit of the generator
         if self.snapshot.commit != before.commit:
             self._packs_since_tidy += 1
@@ -670,8 +598,7 @@ class Worker:
                 ALLOWED_SIGNERS,
             )
 
-    def _record_reached(self, *, pushed: bool) -> None:
-        self._demands.blocked = ""
+    def _record_reached(self, *, pushed: bool = False) -> None:
         self.remote.record_reached(pushed=pushed)
         self._agenda.fetched(reached=True)
 
@@ -679,7 +606,6 @@ class Worker:
         # returns for how many seconds the remote denies all pushes; 0 if it is away
         if self._ends_soon.is_set():  # there is no retry to report
             return 0.0
-        self._demands.blocked = str(error)
         if isinstance(error, PushDenied):
             self._agenda.fetched(reached=True)
         else:

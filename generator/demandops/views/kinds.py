@@ -28,6 +28,7 @@ from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
+from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.views import vocabulary
@@ -114,7 +115,9 @@ def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
     for row in rows_of(source, name):
         since = row.item.get("since") if kind.trailer else None
         began[row.item["name"]] = parse_time(since) if since else None
-    stopped = reader.stopped_releases(source.commit) if name == "releases" else {}
+    stopped = dict[str, list[str]]()
+    if name == "releases":
+        stopped = commit_log.stopped_releases(reader.objects, source.commit)
     for number, entry in enumerate(reader.log(source.commit)):
         if number == MOST_COMMITS:
             return [*map(kind.row, past.values())], entry.commit

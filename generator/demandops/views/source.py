@@ -49,6 +49,7 @@ from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger, World, changes_on
 from demandops.model.release import Release, ServiceRelease, claims_of
 from demandops.repo.history.commit_log import LogEntry
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Problem, Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
@@ -149,7 +150,8 @@ class Source:
     @classmethod
     def read(cls, reader: Reader, snapshot: Snapshot, **more: Any) -> Source:  # noqa: ANN401
         entry = next(reader.log(str(snapshot.commit)))
-        problems, remedy = reader.problems_of(snapshot), reader.how_to_mend(snapshot)
+        problems = snapshots.problems_of(reader.objects, snapshot)
+        remedy = snapshots.how_to_mend(reader.objects, snapshot)
         own = reader.for_another_thread
         return cls(snapshot, entry, REAL.now(), own, problems, remedy, **more)
 

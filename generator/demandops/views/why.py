@@ -31,6 +31,7 @@ from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.records import waiting_path
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import domain_folder, path_of
+from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry, PathHistory
 from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.repo.load import ledger_files
@@ -99,7 +100,7 @@ def find(source: Source, name: str, kind: str | None = None) -> Thing:
     # a part of a release's name, or the start of a demand's id; what runs before what has ended
     running = sorted(release for release in source.releases if name in release)
     demands = sorted(id for id in _demands(source) if id.startswith(name))
-    stopped = reader.stopped_releases(source.commit).values()
+    stopped = commit_log.stopped_releases(reader.objects, source.commit).values()
     ended = sorted({release for names in stopped for release in names})
     were = [release for release in ended if name in release]
     past = {id for entry in reader.log(source.commit) for id in entry.trailers.get("Demand-Id", ())}
@@ -172,7 +173,7 @@ def _there(source: Source, name: str) -> Iterator[tuple[str, str]]:
 
 
 def _gone(source: Source, reader: Reader, name: str) -> Iterator[tuple[str, str]]:
-    if path := reader.release_path(name, source.commit):
+    if path := commit_log.release_path(reader.objects, source.commit, name):
         yield "release", path
     for subject in (Subject(kind, name) for kind in SubjectKind):
         if _has_history(source, reader, folder := claim_files.folder_of(subject)):

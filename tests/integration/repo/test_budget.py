@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from demandops.model.demand import goals as demand_goals
+from demandops.repo.git.repository import StateRepository
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve import agenda, worker
 from demandops.serve.agenda import Agenda
@@ -242,9 +243,11 @@ def test_a_round_ends_with_a_demand_whose_template_takes_too_long(
     nodes, template = person.read(NODES).replace("{cpu: 1}", "{cpu: 9}"), person.read(TEMPLATE)
     person.change({NODES: nodes, TEMPLATE: ENDLESS + template}, "Room, and no end")
     rig.book(crowded, goals.link(1))
-    turns = Agenda(0, crowded._repository.runtime)
+    # two threads must not use one repository
+    own = StateRepository(bare)
+    turns = Agenda(0, own.runtime)
     with processor_time(0.1):
-        turns.book_waiting(CommitBatch(crowded._repository, crowded.snapshot))
+        turns.book_waiting(CommitBatch(own, crowded.snapshot))
     assert turns.left
     person.change({TEMPLATE: template}, "An end")
     rig.book(crowded, goals.link(2))

@@ -25,7 +25,7 @@ from demandops.serve.agenda import (
     RateLimit,
     parse_interval,
 )
-from demandops.serve.worker import RemoteMonitor
+from demandops.serve.demands import Remote
 
 from tests.kit.clock import Clock
 from tests.kit.config import configuration, edited, state_of
@@ -158,27 +158,27 @@ def test_anything_else_is_no_interval(text: str) -> None:
 
 def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, logger="demandops")
-    remote = RemoteMonitor("https://git.example/state.git", clock)
+    remote = Remote("https://git.example/state.git", clock)
     remote.record_reached()
     for _ in range(3):
         remote.record_failure("cannot be fetched: no route")
-    assert remote.status.unreachable == "cannot be fetched: no route"
+    assert remote.unreachable == "cannot be fetched: no route"
     clock.pass_(90)
     for _ in range(3):
         remote.record_reached(pushed=True)
     away, back = caplog.messages
     assert away.startswith("cannot be fetched: no route; trying again")
     assert back == "https://git.example/state.git is back after 90 s"
-    assert not remote.status.unreachable and remote.status.last_push is not None
+    assert not remote.unreachable and remote.last_push is not None
 
 
 def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) -> None:
-    remote = RemoteMonitor("somewhere", clock)
+    remote = Remote("somewhere", clock)
     remote.record_failure("takes no push: frozen", is_denied=True)
     remote.record_reached()
-    assert (remote.status.push_denied, remote.status.unreachable) == ("takes no push: frozen", "")
+    assert (remote.push_denied, remote.unreachable) == ("takes no push: frozen", "")
     remote.record_reached(pushed=True)
-    assert remote.status.push_denied == ""
+    assert remote.push_denied == ""
 
 
 def test_a_rate_limit_counts_a_hand_in_once_and_forgets_who_sends_no_more() -> None:

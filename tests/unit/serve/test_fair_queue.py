@@ -10,7 +10,7 @@ import pytest
 from demandops.base.errors import QueueFull
 from demandops.base.runtime import REAL
 from demandops.model.demand import goals
-from demandops.serve.demands import Demands, FairQueue
+from demandops.serve.demands import Demands, FairQueue, Remote
 from demandops.serve.journal import Journal, Ticket
 
 from tests.kit.memory import NOW
@@ -128,7 +128,7 @@ def test_every_demand_comes_once_and_in_the_order_of_its_subjects(seed: int) -> 
 def test_too_many_demands_are_told_with_their_requester(
     tmp_path: Path, goal: dict[str, Any], whose: str
 ) -> None:
-    demands = Demands(Journal(tmp_path / "journal"), 10, 1, REAL)
+    demands = Demands(Journal(tmp_path / "journal"), 10, 1, Remote("", REAL), REAL)
     tickets = [Ticket(name, goals.read_goal(goal), REAL.now()) for name in ("a", "b")]
     for ticket in tickets:
         demands.arrive(ticket)

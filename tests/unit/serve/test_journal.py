@@ -16,7 +16,7 @@ import pygit2
 import pytest
 from demandops.base.errors import StateRepoError
 from demandops.repo import new_repo
-from demandops.repo.slot import Slot
+from demandops.repo.git.remote_repository import Slot
 from demandops.serve.journal import (
     DamagedJournal,
     Journal,

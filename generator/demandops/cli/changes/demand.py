@@ -40,6 +40,7 @@ from demandops.decide.decision import Decision, decide
 from demandops.model.config.base_model import duration_text
 from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
+from demandops.repo.load.snapshot import refuse_other_render_version
 from demandops.serve.generator import Generator
 from demandops.serve.journal import Receipt
 from demandops.serve.proposal import parse_waiting_text
@@ -319,7 +320,7 @@ def _decided(
     documents: list[Document], state_repo: str
 ) -> Iterator[tuple[int, Document, Decision | InvalidInput]]:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
-        repo.refuse_other_render_version()
+        refuse_other_render_version(repo.objects, repo.repository.tip())
         state = repo.snapshot(progress=report).state
         # each request is decided as if the requests before it were booked
         committed, written = repo.file_reader(), dict[str, str | None]()

@@ -35,6 +35,7 @@ from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo import reader
 from demandops.repo.history import commit_log
+from demandops.repo.load.ledger_files import restoration
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.views.vocabulary import Json, claim_data
@@ -89,7 +90,7 @@ def _book(
         with progress("reading the ledger") as report:
             state = repo.snapshot(progress=report).state
         goal = goal_of(repo, state)
-        request = repo.restoration(goal) if isinstance(goal, Rollback) else goal
+        request = restoration(repo.objects, goal) if isinstance(goal, Rollback) else goal
         data: Json = {"outcome": "unchanged", "commit": None, "releases": []}
         try:
             decision = decide(state, request, REAL.now(), repo.file_reader())

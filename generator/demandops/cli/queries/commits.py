@@ -29,6 +29,7 @@ from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
 from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry
+from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.views.kinds import KINDS, event, rows_of
@@ -167,7 +168,7 @@ def loaded(repo: Reader, revision: str | None) -> Snapshot:
     commit = resolved(repo, revision)
     with progress("reading the ledger") as report:
         snapshot = repo.snapshot(commit, report)
-    for problem in repo.problems_of(snapshot):
+    for problem in snapshots.problems_of(repo.objects, snapshot):
         errors.print(f"warning: not in effect: {problem}")
     if snapshot.faults:
         errors.print(f"warning: {in_effect(repo, snapshot)}")
@@ -178,7 +179,7 @@ def in_effect(repo: Reader, snapshot: Snapshot) -> str:
     """Tell which configuration is in effect instead of the newest, and how to change that."""
     return (
         f"the configuration of commit {str(snapshot.configuration)[:10]} stays in effect until a "
-        f"commit is valid; {repo.how_to_mend(snapshot)}"
+        f"commit is valid; {snapshots.how_to_mend(repo.objects, snapshot)}"
     )
 
 
@@ -287,7 +288,8 @@ def log(
         release, path = given.pop("release"), None
         if release is not None:
             tip = repo.commit((commit_range or "").rpartition("..")[2])
-            path = release if "/" in release else repo.release_path(release, tip)
+            is_path = "/" in release
+            path = release if is_path else commit_log.release_path(repo.objects, tip, release)
             if path is None:
                 raise StateRepoError(
                     f"up to commit {tip[:10]}, there was no release {quoted(release)}; "

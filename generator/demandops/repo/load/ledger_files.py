@@ -60,13 +60,23 @@ def owner_faults(claim: Claim | None, was: Claim | None, path: str) -> Iterator[
 
 
 def as_last_written(repo: Repository, to: Oid, path: str) -> Claim | None:
-    """Return the newest valid claim that a generator, or a merged proposal, wrote to a file."""
+    """Return the newest valid claim that a generator, or a merged proposal, wrote to a file.
+
+    None if somebody has deleted it since.
+    """
     for entry, _, exists in commit_log.changes_to(repo, to, path):
-        if entry.trailers:  # a person's commit has none
-            claim = valid_claim_at(trees.commit_of(repo, entry.commit).tree, path)
-            if claim or not exists:
-                return claim
+        if not exists:
+            return None
+        # a person's commit has no trailers
+        claim = valid_claim_at(trees.commit_of(repo, entry.commit).tree, path)
+        if entry.trailers and claim:
+            return claim
     return None
+
+
+def was_deleted(repo: Repository, path: str, after: Oid, to: Oid) -> bool:
+    line = commit_log.first_parents(repo, to, after)
+    return any(trees.entry(commit.tree, path) is None for commit in line)
 
 
 def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:

@@ -118,51 +118,101 @@ def load(
     revision: str | Oid,
     progress: Progress = lambda done, total: None,
     entry: LogEntry | None = None,
+    before: Snapshot | None = None,
 ) -> Snapshot:
-    """Read all files of a commit, and with ``entry`` the configuration that the commit names.
+    """Read a commit's ledger, and with ``entry`` the configuration that the commit names.
 
-    InvalidInput is raised if that configuration is not valid.
+    After a known commit ``before``, only what differs is read. InvalidInput is raised if that
+    configuration is not valid.
     """
     commit = trees.commit_of(repo, revision)
-    tree, configuration = commit.tree, configuration_of(repo, commit, entry)
-    config = config_at(trees.commit_of(repo, configuration).tree)
-    ledger, put_back, faults = ledger_at(repo, commit, progress, entry)
-    told = None if configuration == commit.id else config_ids(tree)
-    state = State(config, ledger, EVALUATE)
+    configuration = configuration_of(repo, commit, entry)
+    source, config = trees.commit_of(repo, configuration).tree, None
+    if before:
+        known = trees.commit_of(repo, before.configuration).tree
+        config = None if trees.differ(known, source, CONFIG_ROOTS) else before.state.config
+    config = config or config_at(source)
+    read = _read_ledger(repo, before, commit, progress, entry)
+    is_own = configuration == commit.id
     return Snapshot(
-        commit.id, state, configuration, told=told, put_back=put_back, claim_faults=tuple(faults)
+        commit.id,
+        read.state_with(before.state if before else None, config),
+        configuration,
+        faults=before.faults if before and not is_own else (),
+        refused=before.refused if before and not is_own else None,
+        told=None if is_own else config_ids(commit.tree),
+        put_back=read.put_back,
+        claim_faults=tuple(read.faults),
     )
 
 
-def ledger_at(
-    repo: Repository, commit: Commit, progress: Progress, entry: LogEntry | None
-) -> tuple[Ledger, dict[str, Claim | None], list[Fault]]:
-    """Return the ledger, with what is in effect for files of claims that are not valid."""
-    put_back, faults = dict[str, Claim | None](), list[Fault]()
+class _LedgerRead(NamedTuple):
+    ledger: Ledger
+    changes: list[ClaimChange]
+    # files of claims that are not valid → the claims in effect instead
+    put_back: dict[str, Claim | None]
+    faults: list[Fault]
+    # files of waiting demands that are not valid → their texts from before
+    waiting: dict[str, str]
+
+    def state_with(self, before: State | None, config: Config) -> State:
+        if before and config == before.config and self.ledger.ended == before.ledger.ended:
+            return before.with_ledger(self.ledger, self.changes)
+        return State(config, self.ledger, EVALUATE)
+
+
+def _read_ledger(
+    repo: Repository,
+    before: Snapshot | None,
+    commit: Commit,
+    progress: Progress = lambda done, total: None,
+    entry: LogEntry | None = None,
+) -> _LedgerRead:
+    """Read the ledger of a commit; of what is as at ``before``, the content is known."""
+    old, new = trees.commit_of(repo, before.commit).tree if before else None, commit.tree
+    ledger = before.state.ledger if before else Ledger()
+    ledger = replace(ledger, ended=records.read_ended_override(end_markers_at(new)))
+    changes, waiting = list[ClaimChange](), dict[str, str]()
+    put_back = dict(before.put_back) if before else {}
+    faults = list(before.claim_faults) if before else []
+    if trees.differ(old, new, (records.WAITING_ROOT,)):
+        texts = trees.texts(new, (records.WAITING_ROOT,))
+        ledger = replace(ledger, waiting=records.read_all_waiting(texts))
+    for path, blob in trees.differences(old, new, (records.WAITING_ROOT,)):
+        text = trees.read_text(old, path) or ""
+        waits = records.read_waiting(text, path)
+        # who deletes the file withdraws the demand
+        if blob is not None and waits and waits.demand not in ledger.waiting:
+            waiting[path] = text
+            ledger = replace(ledger, waiting=ledger.waiting.insert(waits.demand, waits))
+            faults.append(fault("", "is not a valid waiting demand").within(path))
     # the second version put no claim back, and named those that were not in effect
     held_back = entry.trailers.get("Held-Back", ()) if entry else ()
-    ledger = Ledger()
-    files = trees.blobs(commit.tree, (claim_files.LEDGER_ROOT,))
-    blobs = [(path, blob) for path, blob in files if claim_files.kind_of(path)]
-    for done, (path, blob) in enumerate(blobs):
+    paths = [*ledger_files.changed_files(old, new)]
+    for done, path in enumerate(paths):
         if done % 200 == 0:
-            progress(done, len(blobs))
+            progress(done, len(paths))
+        was = put_back.pop(path) if path in put_back else valid_claim_at(old, path)
         try:
-            claim: Claim | None = claim_files.read(trees.text_of(blob), path)
+            claim = ledger_files.claim_at(new, path)
+            conflict = list(ledger_files.owner_faults(claim, was, path))
             if path in held_back:
-                raise InvalidInput([fault("", "no demand could have booked this").within(path)])
+                conflict = [fault("", "no demand could have booked this").within(path)]
+            if conflict:
+                raise InvalidInput(conflict)
         except InvalidInput as error:
             faults += error.faults
-            put_back[path] = claim = ledger_files.as_last_written(repo, commit.id, path)
-        if claim is not None:
-            ledger = ledger.replace(claim.key, claim)
-    progress(len(blobs), len(blobs))
-    ended = records.read_ended_override(end_markers_at(commit.tree))
-    return replace(ledger, ended=ended, waiting=_waiting(commit.tree)), put_back, faults
-
-
-def _waiting(tree: Tree) -> records.WaitingDemands:
-    return records.read_all_waiting(trees.texts(tree, (records.WAITING_ROOT,)))
+            claim = was
+            if before is None:
+                claim = ledger_files.as_last_written(repo, commit.id, path)
+            elif was and ledger_files.was_deleted(repo, path, before.commit, commit.id):
+                claim = None
+            put_back[path] = claim
+        if claim != was and (key := (claim or was)) is not None:
+            changes.append(ClaimChange(was, claim))
+            ledger = ledger.replace(key.key, claim)
+    progress(len(paths), len(paths))
+    return _LedgerRead(ledger, changes, put_back, faults, waiting)
 
 
 def configuration_of(repo: Repository, commit: Commit, entry: LogEntry | None) -> Oid:
@@ -316,12 +366,18 @@ def follow(
             ) from None
     for commit, entry in _by_generator(repo, to, before.commit):
         try:
-            before = _taken_over(repo, before, commit, entry)
-        except StateRepoError as refused:  # unless people have put this right since
-            try:
+            # what another generator has published is right, so it is not judged or rendered again
+            before = load(repo, commit.id, entry=entry, before=before)
+        except (InvalidInput, StateRepoError) as refused:
+            try:  # people may have put this right since
                 before = replace(load(repo, to), is_rendered=False)
             except (InvalidInput, StateRepoError):
-                raise refused from None
+                if isinstance(refused, StateRepoError):
+                    raise refused from None
+                raise StateRepoError(
+                    f"another generator's commit {commit.id} has a configuration in effect which "
+                    f"is not valid for this program ({refused.faults[0]}); update this generator"
+                ) from None
         break
     if before.commit == to and before.is_settled and not again:
         return Followed(before, before)
@@ -362,81 +418,6 @@ def with_started_leases(repo: Repository, followed: Followed, now: datetime) -> 
     # a lease does not affect a release, so the usage of nodes need not be counted again
     snapshot = replace(snapshot, state=snapshot.state.with_ledger(ledger, ()))
     return replace(followed, snapshot=snapshot, change=replace(followed.change, files=files))
-
-
-def _taken_over(repo: Repository, before: Snapshot, commit: Commit, entry: LogEntry) -> Snapshot:
-    # What another generator has published is right, so nothing of it is judged or rendered again.
-    configuration = configuration_of(repo, commit, entry)
-    tree, source = commit.tree, trees.commit_of(repo, configuration).tree
-    config = before.state.config
-    if config_ids(source) != config_ids(trees.commit_of(repo, before.configuration).tree):
-        try:
-            config = config_at(source)
-        except InvalidInput as error:
-            raise StateRepoError(
-                f"another generator has the configuration of commit {configuration} in effect, "
-                f"which is not valid for this program ({error.faults[0]}); update this generator"
-            ) from None
-    read = _ledger_after(repo, before, commit)
-    is_own = configuration == commit.id
-    return Snapshot(
-        commit.id,
-        read.state_with(before.state, config),
-        configuration,
-        () if is_own else before.faults,
-        None if is_own else before.refused,
-        None if is_own else config_ids(tree),
-        read.put_back,
-        tuple(read.faults),
-    )
-
-
-class _LedgerRead(NamedTuple):
-    ledger: Ledger
-    changes: list[ClaimChange]
-    put_back: dict[str, Claim | None]
-    faults: list[Fault]
-    # files of waiting demands that are not valid → their texts from before
-    waiting: dict[str, str]
-
-    def state_with(self, before: State, config: Config) -> State:
-        if config == before.config and self.ledger.ended == before.ledger.ended:
-            return before.with_ledger(self.ledger, self.changes)
-        return State(config, self.ledger, EVALUATE)
-
-
-def _ledger_after(repo: Repository, before: Snapshot, commit: Commit) -> _LedgerRead:
-    old, new = trees.commit_of(repo, before.commit).tree, commit.tree
-    ledger = replace(before.state.ledger, ended=records.read_ended_override(end_markers_at(new)))
-    if trees.differ(old, new, (records.WAITING_ROOT,)):
-        ledger = replace(ledger, waiting=_waiting(new))
-    changes, waiting = list[ClaimChange](), dict[str, str]()
-    put_back, faults = dict(before.put_back), list(before.claim_faults)
-    for path, blob in trees.differences(old, new, (records.WAITING_ROOT,)):
-        text = trees.read_text(old, path) or ""
-        waits = records.read_waiting(text, path)
-        # who deletes the file withdraws the demand
-        if blob is not None and waits and waits.demand not in ledger.waiting:
-            waiting[path] = text
-            ledger = replace(ledger, waiting=ledger.waiting.insert(waits.demand, waits))
-            faults.append(fault("", "is not a valid waiting demand").within(path))
-    for path in ledger_files.changed_files(old, new):
-        was = before.put_back.get(path) or valid_claim_at(old, path)
-        put_back.pop(path, None)
-        try:
-            claim = ledger_files.claim_at(new, path)
-            if conflict := list(ledger_files.owner_faults(claim, was, path)):
-                raise InvalidInput(conflict)
-        except InvalidInput as error:
-            faults += error.faults
-            claim = was
-            if was is None and trees.entry(old, path) is not None:
-                claim = ledger_files.as_last_written(repo, commit.id, path)
-            put_back[path] = claim
-        if claim != was and (key := (claim or was)) is not None:
-            changes.append(ClaimChange(was, claim))
-            ledger = ledger.replace(key.key, claim)
-    return _LedgerRead(ledger, changes, put_back, faults, waiting)
 
 
 # By the ids of their files, the newest configurations that were judged.
@@ -483,7 +464,7 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
     """
     commit, old = trees.commit_of(repo, wanted.commit), before.state
     tree = commit.tree
-    read = _ledger_after(repo, before, commit)
+    read = _read_ledger(repo, before, commit)
     state = read.state_with(old, wanted.state.config)
     renders_all = (
         state.config != old.config
@@ -650,6 +631,8 @@ def commits_to_revert(repo: Repository, snapshot: Snapshot) -> list[str]:
 
 
 def how_to_mend(repo: Repository, snapshot: Snapshot) -> str:
+    if not snapshot.faults:
+        return ""
     commits = commits_to_revert(repo, snapshot)
     if not 0 < len(commits) <= _MOST_REVERTED:
         return "correct the files"

@@ -142,7 +142,7 @@ class CommitBatch:
             str(before.commit),
             str(told.configuration) if told.faults else "",
             snapshots.problems_of(self._objects, told),
-            snapshots.how_to_mend(self._objects, told) if told.faults else "",
+            snapshots.how_to_mend(self._objects, told),
             [
                 *of_overrides,
                 *commit_message.demand_trailers(followed.keys),
