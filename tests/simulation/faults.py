@@ -250,7 +250,7 @@ def count_released_room_as_taken(plus: Any, usage: Any, more: Any) -> Any:
 # ---- overrides ----
 
 
-@wrong(8, decision, "plan_change")
+@wrong(29, decision, "plan_change")
 def apply_no_override_to_what_a_demand_changes(
     plan: Any, before: Any, after: Any, *more: Any
 ) -> Any:
