@@ -48,9 +48,12 @@ def test_a_parameter_forges_no_message(bare: Path, person: Person, text: str) ->
         rig.book(generator, goal(1))
 
 
-@pytest.mark.parametrize("message", [f"Forged\n\n{FORGED}\n", "Render-Version: 1\n\nFrom: x\n"])
+@pytest.mark.parametrize(
+    ("message", "text"),
+    [(f"Forged\n\n{FORGED}\n", "Why: x"), ("Render-Version: 1\n\nFrom: x\n", "")],
+)
 def test_a_persons_commit_that_quotes_trailers_is_a_persons(
-    generator: Generator, bare: Path, person: Person, message: str
+    generator: Generator, bare: Path, person: Person, message: str, text: str
 ) -> None:
     rig.book(generator, goal(1))
     before = read(bare, DETECTION)
@@ -60,7 +63,7 @@ def test_a_persons_commit_that_quotes_trailers_is_a_persons(
     assert (True, "made by a person") in verdicts(bare)
     with reader.opened(str(bare)) as repo:
         (entry,) = [entry for entry in repo.log() if entry.author == "Petra Platform"][-1:]
-    assert (entry.trailers, entry.why) == ({}, "")
+    assert (entry.trailers, entry.why) == ({}, text)  # what the person wrote, as it is
 
 
 def test_where_keys_are_listed_an_unsigned_commit_is_a_persons(
