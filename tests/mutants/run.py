@@ -1,7 +1,7 @@
 """``make mutants``: which share of small mistakes in the core do its tests find?
 
 Draws ``MUTANTS`` (600) mutants of the core by ``SEED`` (1), from each room in proportion to its
-lines, and runs at most 30 tests that reach the mutated line. It stops after ``MUTANTS_MINUTES``
+lines, and runs at most 200 tests that reach the mutated line. It stops after ``MUTANTS_MINUTES``
 (60), and goes on at the next call: ``build/mutants/`` has what is known of this code and its tests.
 """
 
@@ -36,7 +36,7 @@ PACKAGE = ROOT / "generator" / "demandops"
 ROOMS = ("model", "connections", "decide", "render")
 TESTS = ("tests/unit", "tests/golden", "tests/appdefs")
 READ = ("generator", "templates", "appdefs", "state-repo-skeleton", "tests")
-MOST_TESTS = 30
+MOST_TESTS = 200
 # Runs without a mutant that must pass first: a test that fails in any case finds nothing.
 CONTROLS = 10
 # A mutant that uses more processor time counts as found; most use 4 s, so it would not end.
