@@ -125,6 +125,10 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
         {"topics": {"ego_data": "/{name}/ego"}},
         "nodes[1]: {name} is not in the id 'vehicle{n}'; write one of {id}, {n}",
     ),
+    "too many placeholders": (
+        {"id": "{a}{b}-{c}{d}"},
+        "nodes[1]: '{a}{b}-{c}{d}' has 4 placeholders; write at most three",
+    ),
     "no topic": (
         {"topics": {"ego_data": "{id}"}},
         "nodes[1].topics.ego_data: 'vehicle1' is not a topic name that ROS 2 allows",

@@ -33,6 +33,8 @@ _PLACEHOLDER = re.compile(r"(?<![${])\{([a-z][a-z0-9_]*)\}(?!\})")
 # or a path; what a topic or an address does not allow is a fault of the node.
 _VALUE = "[A-Za-z0-9._-]+"
 _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
+# More would take long to match, as each may be of any length
+_MOST_PLACEHOLDERS = 3
 # A pattern whose entry is valid for one of these is valid. Some texts may not begin with a digit.
 _EXAMPLES = ("1", "a")
 
@@ -141,7 +143,11 @@ class EntryPattern(Generic[Entry]):
 
     def example(self) -> Entry:
         """Return the entry of an id that matches, but with the pattern as its id."""
-        names = {"id": None, **dict.fromkeys(_PLACEHOLDER.findall(self.id))}
+        in_id = _PLACEHOLDER.findall(self.id)
+        if len(in_id) > _MOST_PLACEHOLDERS:
+            message = f"{quoted(self.id)} has {len(in_id)} placeholders; write at most three"
+            raise InvalidInput([fault(field_path(self.place), message).within(self.file)])
+        names = {"id": None, **dict.fromkeys(in_id)}
         if unknown := [name for name in _names_in(self.data) if name not in names]:
             known = ", ".join(f"{{{name}}}" for name in names)
             message = f"{{{unknown[0]}}} is not in the id {quoted(self.id)}; write one of {known}"
