@@ -283,8 +283,7 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
         if domain not in config.domains_at(node):
             continue
         if is_pattern(node.id):
-            (entry,) = (each for each in config.node_patterns if each.id == node.id)
-            written = entry.data["selector"].items()
+            written = config.node_patterns[node.id].data["selector"].items()
             tests = [_has(k, f".matches({_text(f'^{any_value_of(v)}$')})") for k, v in written]
             by_pattern.append(f"({' && '.join(tests) or 'true'})")
         elif len(node.selector) == 1:

@@ -535,7 +535,7 @@ def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
     node, domain = source.config.nodes.get(id), source.config.domain_of.get(id)
     state = "open" if node else "not in the inventory"
     if is_pattern(id):  # it stands for all nodes that it matches
-        (node,) = (each for each in source.config.kinds_of_nodes() if each.id == id)
+        node = source.config.node_patterns[id].example
         state, possible = "pattern", source.config.domains_at(node)
         domain = possible[0] if len(possible) == 1 else None
     return {

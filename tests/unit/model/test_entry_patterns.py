@@ -180,5 +180,5 @@ def test_a_node_of_many_patterns_is_found_among_few() -> None:
     entries = [{"id": f"fleet{i}-{{n}}", "type": "car", "cluster": "c-its"} for i in range(3000)]
     config = load(configuration(inventory(*entries)))
     assert [pattern for _, pattern in config.unlisted.candidates("fleet77-5")] == [
-        config.node_patterns[77]
+        config.node_patterns["fleet77-{n}"]
     ]

@@ -91,7 +91,7 @@ class Config:
     # Every override; `demandops.model.ledger.ledger.World` knows which of them have ended
     overrides: Mapping[str, Override] = field(default_factory=dict)
     # The nodes and brokers whose id is a pattern
-    node_patterns: tuple[EntryPattern[Node], ...] = ()
+    node_patterns: Mapping[str, EntryPattern[Node]] = field(default_factory=dict)
     broker_patterns: tuple[EntryPattern[Broker], ...] = ()
     unlisted: UnlistedNodes = field(default=NOTHING_UNLISTED, compare=False, repr=False)
     clients: ClientsFile = registry.DEFAULT_SETTINGS
@@ -170,11 +170,11 @@ class Config:
     def kinds_of_nodes(self) -> Iterator[Node]:
         """Yield each listed node, and for each pattern one that stands for all its nodes."""
         yield from self.nodes.values()
-        yield from (pattern.example() for pattern in self.node_patterns)
+        yield from (pattern.example for pattern in self.node_patterns.values())
 
     def example_nodes(self) -> Iterator[str]:
         """Yield for each pattern an id of a node in an access domain, as far as it is found."""
-        for pattern in self.node_patterns:
+        for pattern in self.node_patterns.values():
             yield from (id for id in pattern.example_ids() if id in self.domain_of)
 
     def domains_at(self, node: Node) -> list[AccessDomain]:
@@ -294,7 +294,7 @@ class ConfigReader:
                     pattern = EntryPattern(name, key, item, entry, file, at)
                     places[name] = (file, field_path(at))
                     try:
-                        pattern.example()
+                        _ = pattern.example  # so that its faults are those of the file
                         self.patterns[collection].append(pattern)
                     except InvalidInput as error:
                         self.faults += error.faults

@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -141,8 +141,9 @@ class EntryPattern(Generic[Entry]):
             faults = faults_of(error, self.model, self.file, self.place)
         raise InvalidInput(faults)
 
+    @cached_property
     def example(self) -> Entry:
-        """Return the entry of an id that matches, but with the pattern as its id."""
+        """The entry of an id that matches, but with the pattern as its id; may be invalid."""
         in_id = _PLACEHOLDER.findall(self.id)
         if len(in_id) > _MOST_PLACEHOLDERS:
             message = f"{quoted(self.id)} has {len(in_id)} placeholders; write at most three"

@@ -93,7 +93,7 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
     for pattern in reader.patterns[configs.NODES_FILE]:
-        node = pattern.example()
+        node = pattern.example
         for domain in unlisted.possible_domains(pattern.id):
             _in_further_domains(reader, {node.id: node}, domains, {node.id: domain})
     all_nodes = {id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()}
@@ -146,7 +146,7 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         repo_settings=settings,
         clusters=clusters,
         nodes=all_nodes,
-        node_patterns=tuple(reader.patterns[configs.NODES_FILE]),
+        node_patterns={each.id: each for each in reader.patterns[configs.NODES_FILE]},
         broker_patterns=tuple(reader.patterns[configs.BROKERS_FILE]),
         unlisted=unlisted,
         brokers=brokers,
