@@ -103,7 +103,7 @@ def changing(
                 "--reason",
                 metavar="TEXT",
                 callback=lambda ctx, param, text: " ".join((text or "").split()),
-                help="The reason, for the commit message and for the file of an override.",
+                help="Why; the commit message says it, and the file of an override.",
             ),
             *more,
             *([target.dry_run_option] if dry_run else []),
