@@ -28,6 +28,7 @@ from hypothesis import strategies as st
 
 from tests.e2e.rig import tools
 from tests.integration import greedy_helm
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.cli import Ran
 from tests.kit.http import Server, serving
@@ -36,15 +37,8 @@ from tests.kit.repo import git
 CHARTS = "appdefs/object-detection-fusion/charts"
 CHART = f"{CHARTS}/object-fusion"
 LIBRARY = "appdefs/charts/ros-service"
-FILES = [
-    f"{CHART}/Chart.yaml", f"{CHART}/values.yaml", f"{CHART}/templates/service.yaml",
-    f"{LIBRARY}/Chart.yaml", f"{LIBRARY}/values.schema.json",
-    "appdefs/object-detection-fusion/appdef.yaml", "registry/charts.yaml", "inventory/nodes.yaml",
-    "demandops.yaml",
-]  # fmt: skip
-FOLDERS = [
-    "appdefs", LIBRARY, CHART, f"{CHART}/charts", f"{CHART}/templates", "ledger", "overrides",
-]  # fmt: skip
+LISTED = plain_yaml.beside(__file__)
+FILES, FOLDERS = LISTED["files"], LISTED["folders"]
 Picture = dict[str, tuple[object, ...]]
 Told = Callable[[Callable[["Lab"], object]], list[str]]
 
@@ -251,12 +245,7 @@ STEPS = [
     leaves_a_pipe, packs_an_archive, refers_elsewhere, doubles, nests_git, digs,
     writes_hostile_templates,
 ]  # fmt: skip
-WORDS = st.sampled_from([
-    "../../..", "../../../../../../sentinel", "../../../../../..", "/etc", "/", "/dev/zero",
-    "/proc/self", ".", "..", "", "a\0b", "a/b", "..\\..", "-x", "--post-renderer=/bin/sh", "~",
-    "null", "x" * 300, "Ros-Service", "oci://127.0.0.1:1/x", "http://127.0.0.1:1/x",
-    "appdefs/./charts", "appdefs", "\u202e", "{{ .Values }}",
-])  # fmt: skip
+WORDS = st.sampled_from(LISTED["words"])
 
 
 @pytest.mark.parametrize(
