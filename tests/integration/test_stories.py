@@ -44,6 +44,8 @@ class Step(FrozenModel):
     """Commands of git in the clone."""
     links: dict[str, str] = Field(default_factory=dict)
     """Links in the clone, by path; each replaces what is there."""
+    notes: dict[str, str] = Field(default_factory=dict)
+    """More names for the later steps, such as `seen: $head`."""
     run: str = ""
     """The command. Those that take a state repo get ``--state-repo $repo``, unless `inside` says in
     which folder of the clone, or `environment` with which variables, the command runs.
@@ -121,6 +123,7 @@ class Teller:
         words["head"] = git(repo, "rev-parse", words["branch"])
         words |= {"tip": self.repo.tip, "clone": str(self.clone), "folder": str(self._folder)}
         step = Step.model_validate(_filled(told, words | self._names))
+        self._names = self._names | step.notes
         send(repo, step.sends)
         if step.commits:
             texts = self.repo.files()
