@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
+import jsonschema_rs
 import pytest
 import yaml
 from demandops.base.errors import InvalidInput
+from demandops.cli.authoring import schema
 from demandops.decide.warnings import truth_warnings
 from demandops.model.config.load import load
 from demandops.render import gitops
@@ -71,6 +74,16 @@ def test_a_pattern_means_what_the_entries_would() -> None:
             assert known(listed.config)[node] == known(pattern.config)[node]
     differing = {*listed.files.items()} ^ {*pattern.files.items()}
     assert {path for path, _ in differing} == {NODES, BROKERS}
+
+
+def test_an_editor_accepts_placeholders_in_place_of_any_value() -> None:
+    files = inventory({"id": "vehicle{n}"} | VEHICLE, brokers=({**BROKER, "port": "{n}"},))
+    for path, name in ((NODES, "nodes"), (BROKERS, "brokers")):
+        validator = jsonschema_rs.validator_for(json.loads(schema.text(name)))
+        assert [error.message for error in validator.iter_errors(yaml.safe_load(files[path]))] == []
+        wrong = files[path].replace("'{n}'", "'n'")
+        assert wrong != files[path]
+        assert [*validator.iter_errors(yaml.safe_load(wrong))]
 
 
 REFUSED = {
