@@ -24,6 +24,7 @@ from demandops.model.config.entry_patterns import (
     EntryPattern,
     UnlistedNodes,
     is_pattern,
+    may_match,
 )
 from demandops.model.config.inventory import Broker, Cluster, Kind, Node, id_in_domain, kind_of
 from demandops.model.config.override import OVERRIDES_ROOT, Override
@@ -171,6 +172,12 @@ class Config:
         """Yield each listed node, and for each pattern one that stands for all its nodes."""
         yield from self.nodes.values()
         yield from (pattern.example for pattern in self.node_patterns.values())
+
+    def has_node(self, pattern: str) -> bool:
+        """Return whether a node has this name, or may match this pattern with ``*`` and ``?``."""
+        if "*" in pattern or "?" in pattern:
+            return may_match(pattern, (*self.nodes, *self.node_patterns))
+        return pattern in self.nodes or pattern in self.node_patterns
 
     def example_nodes(self) -> Iterator[str]:
         """Yield for each pattern an id of a node in an access domain, as far as it is found."""

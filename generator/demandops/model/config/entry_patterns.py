@@ -99,6 +99,13 @@ def glob_of(id: str) -> str:
     return _PLACEHOLDER.sub("?*", id)
 
 
+def may_match(pattern: str, ids: Iterable[str]) -> bool:
+    """Return whether a pattern with ``*`` and ``?`` may match one of the ids, or of their nodes."""
+    return any(
+        _overlap(pattern, glob_of(id)) if is_pattern(id) else matches(id, (pattern,)) for id in ids
+    )
+
+
 @dataclass(frozen=True)
 class EntryPattern(Generic[Entry]):
     """``data`` is the entry as it is written in ``file`` at ``place``; ``key`` names its id."""
