@@ -316,7 +316,7 @@ class Experiment:
     def _reaches(self, holds: Callable[[], bool], seconds: float) -> bool:
         deadline = time.monotonic() + seconds
         while not holds():
-            self._rig.check()
+            self._rig.parts.check()
             for name in ("participants", "detector"):
                 process = getattr(self, f"_{name}", None)
                 assert process is None or process.poll() is None, f"{name}: {self._log(name)}"

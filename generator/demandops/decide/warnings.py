@@ -341,7 +341,7 @@ def truth_warnings(files: Mapping[str, str]) -> Iterator[Fault]:
 def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
     kinds_of_nodes = sorted(config.kinds_of_nodes(), key=lambda node: node.id)
     nodes = tuple(node.id for node in kinds_of_nodes)
-    brokers = (*config.brokers, *(pattern.id for pattern in config.broker_patterns))
+    brokers = (*config.brokers, *config.broker_patterns)
     for name, domain in sorted(config.domains.items()):
         own = tuple(node.id for node in kinds_of_nodes if domain in config.domains_at(node))
         others = tuple(sorted(config.domains.keys() - {name}))

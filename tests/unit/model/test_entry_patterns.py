@@ -121,6 +121,26 @@ def test_an_id_gives_exactly_one_valid_node(node: str, reason: str) -> None:
     assert reason in "\n".join(repo.faults(goal))
 
 
+@pytest.mark.parametrize(
+    ("node", "reason"),
+    {
+        "v07_a": "'v07_a' matches 'v{n}' in inventory/brokers.yaml: brokers[1] and 'v{n}_a'",
+        "v..7": "'v..7' is no broker of the pattern 'v{n}': inventory/brokers.yaml: ",
+    }.items(),
+)
+def test_no_other_broker_takes_the_place_of_one_that_no_pattern_gives(
+    node: str, reason: str
+) -> None:
+    patterns = ({"node": id, "host": "{id}.fleet"} for id in ("v{n}", "v{n}_a"))
+    nodes = [{"id": f"v{n}", "type": "vehicle", "cluster": "c-its"} for n in (1, "{n}", "{n}_a")]
+    repo = MemoryRepo(inventory(*nodes, brokers=tuple(patterns)))
+    link = {"id": "link", "type": "mqtt", "source": "v1", "target": "edge"}
+    link |= {"broker": node, "topics": [{"source": "/t"}]}
+    demand = {"kind": "Demand", "demand": "d", "requesters": ["v1"], "connections": [link]}
+    assert reason in "\n".join(repo.faults(demand))
+    assert repo.take_all([demand | {"connections": [link | {"broker": "v7"}]}]) == ["booked"]
+
+
 def test_a_placeholder_is_no_word_of_yaml() -> None:
     files = inventory({"id": "vehicle{n}", "topics": {"a": "/{n}/{y}"}})
     assert [*truth_warnings(files)] == []
@@ -136,7 +156,7 @@ def test_a_listed_node_goes_before_a_pattern() -> None:
 MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     "a placeholder that the id has not": (
         {"topics": {"ego_data": "/{name}/ego"}},
-        "nodes[1]: {name} is not in the id 'vehicle{n}'; write one of {id}, {n}",
+        "nodes[1].topics.ego_data: {name} is not in the id 'vehicle{n}'; write one of {id}, {n}",
     ),
     "too many placeholders": (
         {"id": "{a}{b}-{c}{d}"},
@@ -192,6 +212,6 @@ def test_a_pattern_has_its_namespaces_and_its_part_of_the_rule_of_its_cluster() 
 def test_a_node_of_many_patterns_is_found_among_few() -> None:
     entries = [{"id": f"fleet{i}-{{n}}", "type": "car", "cluster": "c-its"} for i in range(3000)]
     config = load(configuration(inventory(*entries)))
-    assert [pattern for _, pattern in config.unlisted.candidates("fleet77-5")] == [
+    assert [*config.unlisted.patterns.candidates("fleet77-5")] == [
         config.node_patterns["fleet77-{n}"]
     ]

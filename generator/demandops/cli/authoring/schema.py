@@ -136,6 +136,6 @@ def _with_placeholders(part: Any) -> Any:  # noqa: ANN401 - any part of a schema
     if part.get("type") in ("integer", "number") or isinstance(part.get("pattern"), str):
         told = {key: part[key] for key in ("title", "description", "examples") if key in part}
         value = {key: part[key] for key in part if key not in told}
-        text = {"type": "string", "pattern": r"\{[a-z][a-z0-9_]*\}"}
+        text = {"type": "string", "pattern": r"\{[A-Za-z_][A-Za-z0-9_]*\}"}
         return told | {"anyOf": [value, text]}
     return {key: _with_placeholders(value) for key, value in part.items()}

@@ -12,6 +12,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from demandops.base import errors, naming, strict_yaml
 from demandops.base.errors import Fault, InvalidInput, Refused, fault, field_path, suggestion
+from demandops.base.placeholders import is_pattern
 from demandops.model.config import registry
 from demandops.model.config.appdef import (
     ApplicationDefinition,
@@ -20,10 +21,11 @@ from demandops.model.config.appdef import (
 )
 from demandops.model.config.base_model import DnsLabel, faults_of, parse, parse_file
 from demandops.model.config.entry_patterns import (
+    NO_BROKER_PATTERNS,
     NOTHING_UNLISTED,
     EntryPattern,
+    EntryPatterns,
     UnlistedNodes,
-    is_pattern,
     may_match,
 )
 from demandops.model.config.inventory import Broker, Cluster, Kind, Node, id_in_domain, kind_of
@@ -93,8 +95,11 @@ class Config:
     overrides: Mapping[str, Override] = field(default_factory=dict)
     # The nodes and brokers whose id is a pattern
     node_patterns: Mapping[str, EntryPattern[Node]] = field(default_factory=dict)
-    broker_patterns: tuple[EntryPattern[Broker], ...] = ()
+    broker_patterns: Mapping[str, EntryPattern[Broker]] = field(default_factory=dict)
     unlisted: UnlistedNodes = field(default=NOTHING_UNLISTED, compare=False, repr=False)
+    unlisted_brokers: EntryPatterns[Broker] = field(
+        default=NO_BROKER_PATTERNS, compare=False, repr=False
+    )
     clients: ClientsFile = registry.DEFAULT_SETTINGS
     versions: Mapping[str, registry.VersionList] = field(default_factory=dict)
     # For each collection, a map from each entry to the file that has the entry
