@@ -163,7 +163,7 @@ def test_a_base_is_not_fetched_from_elsewhere(world: World, slip_in: SlipIn) -> 
     base = {"resources": ["foreign.yaml"]}
     files = {"kustomization.yaml": base, "foreign.yaml": config("foreign", domain.namespace)}
     world.push({f"{ELSEWHERE}/{file}": json.dumps(content) for file, content in files.items()})
-    url = f"{world.rig.git_url(world.name)}//{ELSEWHERE}?ref=main"
+    url = f"{world.url}//{ELSEWHERE}?ref=main"
     slip_in({"resources": [url]}, file=BASE)
     domain.wait_refused("fs-security-constraint")
     assert domain.inventory() == here
@@ -217,7 +217,7 @@ def test_a_release_cannot_leave_its_namespace(
     domain, spec = world.domain, {}
     if project:
         spec = {"project": project, **APPLICATION}
-        spec["source"] = spec["source"] | {"repoURL": world.rig.git_url(world.name)}
+        spec["source"] = spec["source"] | {"repoURL": world.url}
     slip_in(build_manifest(ARGOCD, kind, "foreign", namespace, spec=spec))
     domain.wait_refused(reason, "foreign")
     assert domain.kube.get(kind, "foreign", CONTROL) is None

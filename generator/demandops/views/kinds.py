@@ -12,6 +12,7 @@ from itertools import islice
 from typing import Any
 
 from demandops.base.naming import SubjectKind
+from demandops.base.placeholders import is_pattern
 from demandops.cluster.health import Health
 from demandops.cluster.rollouts import ReleaseStatus
 from demandops.decide.bookkeeping import (
@@ -23,7 +24,6 @@ from demandops.decide.bookkeeping import (
 from demandops.decide.planning.overrides import suspended_by
 from demandops.model.config.base_model import duration_text, parse_time, relative
 from demandops.model.config.config import DOMAINS_FILE
-from demandops.model.config.entry_patterns import is_pattern
 from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand

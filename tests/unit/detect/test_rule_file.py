@@ -72,13 +72,15 @@ def test_the_mistakes_of_the_documentation_are_told_as_it_says() -> None:
 
 
 def test_a_value_cannot_change_the_form_of_a_demand() -> None:
-    named = demand(request='{entity}", "x": {{}}', positions=[{"node": "{entity}", "x": "{x}"}])
+    named = demand(
+        request='{entity}", "x": {}, ${entity}', positions=[{"node": "{entity}", "x": "{x}"}]
+    )
     file = rule_file.read(text_of(rule("a", near=NEAR, demand=named)), "rules.yaml")
     goal = file.rules[0].template.filled({"rule": "a", "entity": "{y}", "x": 1.5})
     assert goal.data == {
         "demand": "a/{y}",
         "requesters": ["{y}"],
-        "request": '{y}", "x": {}',
+        "request": '{y}", "x": {}, ${entity}',
         "positions": [{"node": "{y}", "x": 1.5}],
     }
 

@@ -123,7 +123,7 @@ def test_a_listed_node_goes_before_a_pattern() -> None:
 MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     "a placeholder that the id has not": (
         {"topics": {"ego_data": "/{name}/ego"}},
-        "nodes[1]: {name} is not in the id 'vehicle{n}'; write one of {id}, {n}",
+        "nodes[1].topics.ego_data: {name} is not in the id 'vehicle{n}'; write one of {id}, {n}",
     ),
     "too many placeholders": (
         {"id": "{a}{b}-{c}{d}"},

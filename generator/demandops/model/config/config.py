@@ -12,6 +12,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from demandops.base import errors, naming, strict_yaml
 from demandops.base.errors import Fault, InvalidInput, Refused, fault, field_path, suggestion
+from demandops.base.placeholders import is_pattern
 from demandops.model.config import registry
 from demandops.model.config.appdef import (
     ApplicationDefinition,
@@ -23,7 +24,6 @@ from demandops.model.config.entry_patterns import (
     NOTHING_UNLISTED,
     EntryPattern,
     UnlistedNodes,
-    is_pattern,
 )
 from demandops.model.config.inventory import Broker, Cluster, Kind, Node, id_in_domain, kind_of
 from demandops.model.config.override import OVERRIDES_ROOT, Override

@@ -19,6 +19,15 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from demandops.base.errors import InvalidInput, fault, field_path
+from demandops.base.placeholders import (
+    example_of,
+    filled,
+    glob_of,
+    is_pattern,
+    names,
+    texts,
+    values_in,
+)
 from demandops.base.quoting import quoted
 from demandops.model.config.base_model import faults_of, matches
 from demandops.model.config.inventory import Node
@@ -27,11 +36,6 @@ from demandops.model.config.policy import AccessDomain
 Entry = TypeVar("Entry", bound=BaseModel)
 Value = TypeVar("Value")
 
-# `${n}` and `{{n}}` mean something to others, and are plain text
-_PLACEHOLDER = re.compile(r"(?<![${])\{([a-z][a-z0-9_]*)\}(?!\})")
-# What a placeholder stands for in an id. None of these characters means anything in an expression
-# or a path; what a topic or an address does not allow is a fault of the node.
-_VALUE = "[A-Za-z0-9._-]+"
 _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # More would take long to match, as each may be of any length
 _MOST_PLACEHOLDERS = 3
@@ -91,14 +95,6 @@ def _overlap(one: str, other: str) -> bool:
 # ---- an entry whose id is a pattern ----
 
 
-def is_pattern(id: object) -> bool:
-    return isinstance(id, str) and _PLACEHOLDER.search(id) is not None
-
-
-def glob_of(id: str) -> str:
-    return _PLACEHOLDER.sub("?*", id)
-
-
 @dataclass(frozen=True)
 class EntryPattern(Generic[Entry]):
     """``data`` is the entry as it is written in ``file`` at ``place``; ``key`` names its id."""
@@ -119,15 +115,15 @@ class EntryPattern(Generic[Entry]):
         return glob_of(self.id)
 
     def example_ids(self) -> Iterator[str]:
-        return (_PLACEHOLDER.sub(value, self.id) for value in _EXAMPLES)
+        return (example_of(self.id, value) for value in _EXAMPLES)
 
     def values(self, id: str) -> dict[str, str] | None:
-        match = _expression(self.id).fullmatch(id)
-        return {**match.groupdict(), "id": id} if match else None
+        values = values_in(self.id, id)
+        return values and {**values, "id": id}
 
     def entry(self, id: str) -> Entry:
         """Return the entry of an id that matches; raise ``InvalidInput`` with its faults."""
-        data: Any = _filled(self.data, self.values(id) or {})
+        data: Any = filled(self.data, self.values(id) or {})
         try:
             try:
                 return self.model.model_validate(data)
@@ -144,15 +140,20 @@ class EntryPattern(Generic[Entry]):
     @cached_property
     def example(self) -> Entry:
         """The entry of an id that matches, but with the pattern as its id; may be invalid."""
-        in_id = _PLACEHOLDER.findall(self.id)
+        in_id, where = names(self.id), field_path(self.place)
         if len(in_id) > _MOST_PLACEHOLDERS:
             message = f"{quoted(self.id)} has {len(in_id)} placeholders; write at most three"
-            raise InvalidInput([fault(field_path(self.place), message).within(self.file)])
-        names = {"id": None, **dict.fromkeys(in_id)}
-        if unknown := [name for name in _names_in(self.data) if name not in names]:
-            known = ", ".join(f"{{{name}}}" for name in names)
-            message = f"{{{unknown[0]}}} is not in the id {quoted(self.id)}; write one of {known}"
-            raise InvalidInput([fault(field_path(self.place), message).within(self.file)])
+            raise InvalidInput([fault(where, message).within(self.file)])
+        known = {"id": None, **dict.fromkeys(in_id)}
+        listed = ", ".join(f"{{{name}}}" for name in known)
+        faults = [
+            fault(path, f"{{{name}}} is not in the id {quoted(self.id)}; write one of {listed}")
+            for path, text in texts(self.data, where)
+            for name in names(text)
+            if name not in known
+        ]
+        if faults:
+            raise InvalidInput(each.within(self.file) for each in faults)
         errors = []
         for id in self.example_ids():
             try:
@@ -160,40 +161,6 @@ class EntryPattern(Generic[Entry]):
             except InvalidInput as error:
                 errors.append(error)
         raise errors[0]
-
-
-@lru_cache(maxsize=65_536)
-def _expression(pattern: str) -> re.Pattern[str]:
-    expression, seen = "", set[str]()
-    for index, part in enumerate(_PLACEHOLDER.split(pattern)):  # texts and names in turn
-        if index % 2 == 0:
-            expression += re.escape(part)
-        else:
-            expression += f"(?P={part})" if part in seen else f"(?P<{part}>{_VALUE})"
-            seen.add(part)
-    return re.compile(expression)
-
-
-def any_value_of(text: str) -> str:
-    """Return a regular expression of RE2 for each text that a text with placeholders may become."""
-    parts = _PLACEHOLDER.split(text)
-    return _VALUE.join(map(re.escape, parts[::2]))
-
-
-def _filled(part: object, values: Mapping[str, str]) -> object:
-    if isinstance(part, str):
-        return _PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), part)
-    if isinstance(part, dict):
-        return {_filled(key, values): _filled(value, values) for key, value in part.items()}
-    return [_filled(each, values) for each in part] if isinstance(part, list) else part
-
-
-def _names_in(part: object) -> Iterator[str]:
-    if isinstance(part, str):
-        yield from _PLACEHOLDER.findall(part)
-    elif isinstance(part, dict | list):
-        for each in (*part, *part.values()) if isinstance(part, dict) else part:
-            yield from _names_in(each)
 
 
 def _read_number(
