@@ -14,7 +14,7 @@ PACKAGE_TESTS := tests/packages
 PAGE_TESTS := tests/page
 DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
-KILL_TESTS := tests/integration/repo/test_kill_and_restart.py tests/ros/test_crash.py
+KILL_TESTS := tests/ros/test_crash.py
 # What takes long because it has remotes, crashes, ROS, brokers, servers or much work.
 PROCESS_TESTS := tests/ros tests/conformance tests/experiment tests/unit/decide/test_budget.py \
   tests/unit/model/test_thousands_of_entries.py $(addprefix tests/integration/,repo mqtt web \

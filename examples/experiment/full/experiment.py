@@ -23,6 +23,7 @@ from .participants import POSE, Plan
 from .process_runner import ProcessRunner
 from .rig import (
     CLUSTER,
+    ENDS_WITH_US,
     PATIENCE_S,
     Client,
     Rig,
@@ -30,7 +31,6 @@ from .rig import (
     demandops,
     environment,
     git,
-    launch,
     limited_world,
     reserved,
 )
@@ -286,7 +286,7 @@ class Experiment:
             given["ROS_DOMAIN_ID"] = str(self._domains[domain])
         with (self._folder / f"{name}.log").open("w") as log:
             process = subprocess.Popen(
-                launch.command(sys.executable, "-m", module, *arguments),
+                [*ENDS_WITH_US, sys.executable, "-m", module, *arguments],
                 env=given,
                 cwd=ROOT,
                 stdin=subprocess.PIPE,

@@ -23,7 +23,7 @@ from sensor_msgs.msg import PointCloud2
 
 from .fleet import STATION_CLOUD_TARGET
 from .participants import EGO_DATA, POSE, VEHICLE_CLOUD
-from .rig import FUSION, PATIENCE_S, accepts, free_port, launch, wait_until
+from .rig import ENDS_WITH_US, FUSION, PATIENCE_S, accepts, free_port, wait_until
 
 FUSION_NODE = FUSION.replace("-", "_")
 FUSED = "/edge_object_detection_fusion_global_objectlist"
@@ -135,7 +135,7 @@ class Broker:
         configuration.write_text(f"listener {self.port} 127.0.0.1\nallow_anonymous true\n")
         with (folder / "mosquitto.log").open("w") as log:
             self._process = subprocess.Popen(
-                launch.command(program, "-c", str(configuration)), stdout=log, stderr=log
+                [*ENDS_WITH_US, program, "-c", str(configuration)], stdout=log, stderr=log
             )
         self._counter = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
         self._counter.on_connect = lambda client, *_: client.subscribe("#")
