@@ -28,6 +28,7 @@ from demandops.decide.state import State
 from demandops.model.config.appdef import ignored_fields
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, NODES_FILE, Config
+from demandops.model.config.entry_patterns import may_match
 from demandops.model.config.override import Override
 from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
@@ -340,6 +341,7 @@ def truth_warnings(files: Mapping[str, str]) -> Iterator[Fault]:
 def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
     kinds_of_nodes = sorted(config.kinds_of_nodes(), key=lambda node: node.id)
     nodes = tuple(node.id for node in kinds_of_nodes)
+    brokers = (*config.brokers, *config.broker_patterns)
     for name, domain in sorted(config.domains.items()):
         own = tuple(node.id for node in kinds_of_nodes if domain in config.domains_at(node))
         others = tuple(sorted(config.domains.keys() - {name}))
@@ -347,7 +349,7 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
         kinds = [("nodes", domain.nodes, "node", nodes)]
         for rule in domain.rules:
             place = f"rule '{rule.name}'"
-            appdefs, brokers = (*config.appdefs,), (*config.brokers,)
+            appdefs = (*config.appdefs,)
             kinds += [
                 (f"{place}: applications", rule.applications, "application definition", appdefs),
                 (f"{place}: nodes", rule.nodes, "node of the domain", own),
@@ -357,7 +359,7 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
         file = config.file_of(DOMAINS_FILE, name)
         for where, patterns, what, names in kinds:
             for pattern in patterns:
-                if pattern != "*" and not any(matches(each, (pattern,)) for each in names):
+                if pattern != "*" and not may_match(pattern, names):
                     hint = suggestion(pattern, names) or "; there is none"
                     message = f"{quoted(pattern)} matches no {what}{hint}"
                     yield fault(f"access domain '{name}', {where}", message).within(file)

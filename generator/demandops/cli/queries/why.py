@@ -258,7 +258,7 @@ def may(
         lines = [f"yes: {what}"]
         lines += [f"  {rule} allows it" for rule in answer.rules]
     known = {*state.config.nodes, *state.ledger.indexed_names("requester")}
-    if requester not in known:
+    if requester not in known and not state.config.has_node(requester):
         unknown = f"no node is called '{requester}', and nobody of this name demands anything now"
         errors.print(f"note: {unknown}{suggestion(requester, known)}")
     data = {"requester": requester, "application": application, "allowed": not answer.faults}
