@@ -3,11 +3,47 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from demandops.model.demand.demand import Application
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import demand_id
+
+from tests.model import books as model
 from tests.model.books import Books
-from tests.model.listed import Claim
+from tests.model.listed import Subject
+
+Key = tuple[Subject, str]
+"""A claim's key: its subject and the id of its demand in the ledger."""
+Content = tuple[dict[str, Any], tuple[str, ...]]
+"""What a claim holds, and its requesters."""
+
+
+def key_of(key: model.Key) -> Key:
+    subject, (id, who) = key
+    return subject, demand_id(id, who) if who else id
+
+
+def claims_of(books: Books) -> dict[Key, Content]:
+    return {key_of(key): (claim.content(), claim.who) for key, claim in books.claims.items()}
+
+
+def key_in_ledger(key: claim_files.ClaimKey) -> Key:
+    return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
+
+
+def claims_in_ledger(ledger: Iterable[claim_files.Claim]) -> dict[Key, Content]:
+    return {key_in_ledger(claim.key): (_content(claim), claim.requesters) for claim in ledger}
+
+
+def _content(claim: claim_files.Claim) -> dict[str, Any]:
+    held = claim.held
+    if isinstance(held, Application):
+        fixed = {"type": held.appdef, "node": held.node, "version": held.version}
+        return fixed | {"topics": dict.fromkeys(held.topic_keys(), "")}
+    routes = {(route.source,): route.target for route in held.topics}
+    return {"source": held.source, "target": held.target, "topics": routes, "version": ""}
 
 
 def view(books: Books) -> dict[str, Any]:
@@ -27,7 +63,7 @@ def _services(books: Books) -> dict[tuple[str, str, str], dict[str, Any]]:
         entry["requesters"] |= {*who}
         entry["inputs"].setdefault(role, {}).setdefault(topic, set()).update(who)
 
-    for id, claim in _on("application", books):
+    for id, claim in books.on("application"):
         node, who = claim.fixed["node"], claim.who
         for role, topic, source in claim.topics:
             if role == "ego_data":
@@ -41,17 +77,13 @@ def _services(books: Books) -> dict[tuple[str, str, str], dict[str, Any]]:
 
 def _connections(books: Books) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
-    for id, claim in _on("connection", books):
+    for id, claim in books.on("connection"):
         ends = {end: claim.fixed[end] for end in ("source", "target")}
         entry = found.setdefault(id, {**ends, "topics": {}, "requesters": set()})
         entry["requesters"] |= {*claim.who}
         for (topic,) in claim.topics:
             entry["topics"].setdefault(topic, set()).update(claim.who)
     return _sorted(found)  # type: ignore[no-any-return]
-
-
-def _on(kind: str, books: Books) -> Iterator[tuple[str, Claim]]:
-    return ((id, claim) for ((of, id), _), claim in books.claims.items() if of == kind)
 
 
 def _sorted(value: Any) -> Any:

@@ -19,9 +19,10 @@ from tests.kit import plain_yaml, repo
 from tests.kit.config import texts_below
 from tests.kit.repo import GitRepo
 from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
-from tests.model.leases import Goal
+from tests.model.listed import Goal
+from tests.model.view import key_in_ledger
 from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
-from tests.simulation.promises import Maker, name_of
+from tests.simulation.promises import Maker
 from tests.simulation.world import World
 
 STEPS = 30
@@ -322,9 +323,8 @@ class History:
         found = sorted(self.oracle.claims().items())
         if found:
             path, claim = self.chance.choice(found)
-            demand, subject = name_of(claim)
-            commit = self._commit({path: None})
-            self.oracle.edits[commit] = lambda books: books._drop(demand, subject)
+            gone = self.oracle.key_of(key_in_ledger(claim.key))
+            self.oracle.edits[self._commit({path: None})] = lambda books: books.drop([gone])
 
     def _edit_generated(self) -> None:
         found = sorted(path for path in self._files("clusters/") if path.endswith(".yaml"))

@@ -1,16 +1,11 @@
-"""Random requests with leases, and the ledger's claims in the form of the model of leases."""
+"""Random requests with leases."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from itertools import combinations
 from random import Random
 from typing import Any
 
-from demandops.model.demand.demand import Application
-from demandops.model.ledger.claim import Claim, demand_id
-
-from tests.model.leases import Goal, Subject, name_by_message
+from tests.model.listed import Goal
 
 DEMANDS = ("d0", "d1", "D1", "d/2")
 PEOPLE = ("vehicle00", "vehicle01", "station00")
@@ -105,39 +100,3 @@ class Maker:
         if shutdown:
             self._shutdowns.append(made)
         return made
-
-
-Name = tuple[str, Subject]
-
-
-MESSAGES = {
-    demand_id(request, who): name_by_message(request, who)
-    for request in ("m0", "m1")
-    for count in (1, 2, 3)
-    for who in combinations(PEOPLE, count)
-}
-
-
-def name_of(claim: Claim) -> Name:
-    demand = MESSAGES.get(claim.demand, claim.demand)
-    return demand, (claim.subject.kind.value, claim.subject.id)
-
-
-def claims_of(ledger: Iterable[Claim]) -> dict[Name, tuple[dict[str, Any], frozenset[str]]]:
-    found = {}
-    for claim in ledger:
-        what: dict[str, Any]
-        held = claim.held
-        if isinstance(held, Application):
-            inputs = {
-                role: frozenset((topic.source, topic.topic) for topic in topics)
-                for role, topics in held.inputs.items()
-            }
-            what = {"type": held.appdef, "node": held.node, "inputs": inputs}
-            what["parameters"] = dict(held.parameters)
-            what |= {"version": held.version} if held.version else {}
-        else:
-            topics = {route.source: route.target for route in held.topics}
-            what = {"source": held.source, "target": held.target, "topics": topics}
-        found[name_of(claim)] = what, frozenset(claim.requesters)
-    return found

@@ -13,29 +13,15 @@ from random import Random
 from demandops.decide.decision import Decision
 from demandops.decide.state import rendered_files
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import ClaimKey, demand_id
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples, told
 from tests.kit.memory import MemoryRepo, ledger_in, outcome
-from tests.model.books import Books, Demand, Result
+from tests.model.books import Books, Result
 from tests.model.goals import SKELETON, Maker, shutdown_of
 from tests.model.listed import Goal, Topic
-from tests.model.view import view
-
-Key = tuple[tuple[str, str], str]
-"""A claim's key: its subject and its demand id."""
-
-
-def key_of(subject: tuple[str, str], demand: Demand) -> Key:
-    """Return the key that the program's claim must have for a claim of the model."""
-    return subject, demand_id(*demand) if demand[1] else demand[0]
-
-
-def key_from(key: ClaimKey) -> Key:
-    """Convert the program's key of a claim."""
-    return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
+from tests.model.view import claims_in_ledger, claims_of, key_in_ledger, key_of, view
 
 
 class Walk:
@@ -50,10 +36,7 @@ class Walk:
         expected = self._books.take(request)
         taken = self._repo.take(request)
         assert outcome(taken) == expected.outcome, (expected, taken)
-        claims = {
-            key_of(*key): ({*claim.topics}, claim.who) for key, claim in self._books.claims.items()
-        }
-        assert self._claims() == claims, request
+        assert claims_in_ledger(self._repo.state.ledger) == claims_of(self._books), request
         assert self._repo.view() == view(self._books)
         if isinstance(taken, Decision):
             assert_changes(taken, expected)
@@ -66,12 +49,6 @@ class Walk:
         at_once = rendered_files(fresh)
         assert self._repo.below(*{path.split("/")[0] for path in at_once}) == at_once
 
-    def _claims(self) -> dict[Key, tuple[set[tuple[str, ...]], tuple[str, ...]]]:
-        return {
-            key_from(claim.key): ({*claim.held.topic_keys()}, claim.requesters)
-            for claim in self._repo.state.ledger
-        }
-
     def _assert_counts_once(self, request: Goal) -> None:
         again = request if "kind" in request else self.maker.again(request)
         repo = self._repo.copy()
@@ -83,8 +60,8 @@ class Walk:
 
 def assert_changes(taken: Decision, expected: Result) -> None:
     """Check that exactly the touched claims are written, and that each missing hold is named."""
-    changed = {key_from(change.key) for change in taken.changes.claims}
-    assert changed == {key_of(*key) for key in expected.touched}
+    changed = {key_in_ledger(change.key) for change in taken.changes.claims}
+    assert changed == {key_of(key) for key in expected.touched}
     paths = {claim_files.path_of(change.key) for change in taken.changes.claims}
     assert {path for path in taken.files if claim_files.kind_of(path)} == paths
     assert bool(taken.files) == bool(expected.touched)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
+import jsonschema_rs
 import pytest
 import yaml
 from demandops.base.errors import InvalidInput
+from demandops.cli.authoring import schema
 from demandops.decide.warnings import truth_warnings
 from demandops.model.config.load import load
 from demandops.render import gitops
@@ -73,6 +76,16 @@ def test_a_pattern_means_what_the_entries_would() -> None:
     assert {path for path, _ in differing} == {NODES, BROKERS}
 
 
+def test_an_editor_accepts_placeholders_in_place_of_any_value() -> None:
+    files = inventory({"id": "vehicle{n}"} | VEHICLE, brokers=({**BROKER, "port": "{n}"},))
+    for path, name in ((NODES, "nodes"), (BROKERS, "brokers")):
+        validator = jsonschema_rs.validator_for(json.loads(schema.text(name)))
+        assert [error.message for error in validator.iter_errors(yaml.safe_load(files[path]))] == []
+        wrong = files[path].replace("'{n}'", "'n'")
+        assert wrong != files[path]
+        assert [*validator.iter_errors(yaml.safe_load(wrong))]
+
+
 REFUSED = {
     "vehicle": "is not in inventory/nodes.yaml",
     "vehicle0 7": "is not in inventory/nodes.yaml",
@@ -108,6 +121,26 @@ def test_an_id_gives_exactly_one_valid_node(node: str, reason: str) -> None:
     assert reason in "\n".join(repo.faults(goal))
 
 
+@pytest.mark.parametrize(
+    ("node", "reason"),
+    {
+        "v07_a": "'v07_a' matches 'v{n}' in inventory/brokers.yaml: brokers[1] and 'v{n}_a'",
+        "v..7": "'v..7' is no broker of the pattern 'v{n}': inventory/brokers.yaml: ",
+    }.items(),
+)
+def test_no_other_broker_takes_the_place_of_one_that_no_pattern_gives(
+    node: str, reason: str
+) -> None:
+    patterns = ({"node": id, "host": "{id}.fleet"} for id in ("v{n}", "v{n}_a"))
+    nodes = [{"id": f"v{n}", "type": "vehicle", "cluster": "c-its"} for n in (1, "{n}", "{n}_a")]
+    repo = MemoryRepo(inventory(*nodes, brokers=tuple(patterns)))
+    link = {"id": "link", "type": "mqtt", "source": "v1", "target": "edge"}
+    link |= {"broker": node, "topics": [{"source": "/t"}]}
+    demand = {"kind": "Demand", "demand": "d", "requesters": ["v1"], "connections": [link]}
+    assert reason in "\n".join(repo.faults(demand))
+    assert repo.take_all([demand | {"connections": [link | {"broker": "v7"}]}]) == ["booked"]
+
+
 def test_a_placeholder_is_no_word_of_yaml() -> None:
     files = inventory({"id": "vehicle{n}", "topics": {"a": "/{n}/{y}"}})
     assert [*truth_warnings(files)] == []
@@ -127,7 +160,15 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "too many placeholders": (
         {"id": "{a}{b}-{c}{d}"},
-        "nodes[1]: '{a}{b}-{c}{d}' has 4 placeholders; write at most three",
+        "nodes[1].id: has 4 placeholders; write at most three",
+    ),
+    "the whole id within the id": (
+        {"id": "car{id}"},
+        "nodes[1].id: {id} stands for the whole id; write another name, such as 'car{n}'",
+    ),
+    "a star for a placeholder": (
+        {"id": "car*"},
+        "nodes[1].id: 'car*' is no id; for a pattern, write 'car{n}'",
     ),
     "no topic": (
         {"topics": {"ego_data": "{id}"}},
@@ -179,6 +220,6 @@ def test_a_pattern_has_its_namespaces_and_its_part_of_the_rule_of_its_cluster() 
 def test_a_node_of_many_patterns_is_found_among_few() -> None:
     entries = [{"id": f"fleet{i}-{{n}}", "type": "car", "cluster": "c-its"} for i in range(3000)]
     config = load(configuration(inventory(*entries)))
-    assert [pattern for _, pattern in config.unlisted.candidates("fleet77-5")] == [
+    assert [*config.unlisted.patterns.candidates("fleet77-5")] == [
         config.node_patterns["fleet77-{n}"]
     ]
