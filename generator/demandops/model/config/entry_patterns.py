@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -125,9 +126,13 @@ class EntryPattern(Generic[Entry]):
         match = _expression(self.id).fullmatch(id)
         return {**match.groupdict(), "id": id} if match else None
 
-    def entry(self, id: str) -> Entry:
-        """Return the entry of an id that matches; raise ``InvalidInput`` with its faults."""
-        data: Any = _filled(self.data, self.values(id) or {})
+    def entry(self, id: str, own: Mapping[str, Any] = MappingProxyType({})) -> Entry:
+        """Return the entry of an id that matches; raise ``InvalidInput`` with its faults.
+
+        The fields ``own`` are those of this id alone.
+        """
+        filled: Any = _filled(self.data, self.values(id) or {})
+        data: Any = {**filled, **own}
         try:
             try:
                 return self.model.model_validate(data)
@@ -159,7 +164,7 @@ class EntryPattern(Generic[Entry]):
                 return self.entry(id).model_copy(update={self.key: self.id})
             except InvalidInput as error:
                 errors.append(error)
-        raise errors[0]
+        raise min(errors, key=lambda error: len(error.faults))  # some only concern a digit
 
 
 @lru_cache(maxsize=65_536)
