@@ -224,10 +224,11 @@ def _told(
     # a shutdown may give up some topics of a claim, which then stays
     parts = dict[Subject, str]()
     for change in changes if request.operation == "shutdown" else ():
-        if change.before and change.after:
-            if lost := sorted(_topics(change.before.held) - _topics(change.after.held)):
-                some = f"topic{'s' if len(lost) > 1 else ''} {', '.join(lost)}"
-                parts[change.key.subject] = f"{some} of {change.key.subject.id}"
+        if not (change.before and change.after):
+            continue
+        if lost := sorted(_topics(change.before.held) - _topics(change.after.held)):
+            some = f"topic{'s' if len(lost) > 1 else ''} {', '.join(lost)}"
+            parts[change.key.subject] = f"{some} of {change.key.subject.id}"
     kinds = Counter(each.kind for each in decision.changes.subjects() if each not in parts)
     counts = [(kinds[kind], kind.value[:-1]) for kind in SubjectKind if kinds[kind]]
     counted = (f"{count} {kind}{'s' if count > 1 else ''}" for count, kind in counts)
