@@ -210,10 +210,21 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
     return tuple(sorted({who for claim in claims if claim for who in claim.requesters}))
 
 
-def _topics(held: Held) -> set[str]:
-    if isinstance(held, Application):
-        return {topic.topic for _, topic in held.all_inputs()}
-    return {route.source for route in held.topics}
+def _given_up_in_part(decision: Decision) -> dict[Subject, str]:
+    # of claims that stay, because a shutdown lists only some of their topics
+    def topics(held: Held) -> set[str]:
+        if isinstance(held, Application):
+            return {topic.topic for _, topic in held.all_inputs()}
+        return {route.source for route in held.topics}
+
+    parts = dict[Subject, str]()
+    for change in decision.changes.claims if decision.request.operation == "shutdown" else ():
+        if not (change.before and change.after):
+            continue
+        if lost := sorted(topics(change.before.held) - topics(change.after.held)):
+            some = f"topic{'s' if len(lost) > 1 else ''} {', '.join(lost)}"
+            parts[change.key.subject] = f"{some} of {change.key.subject.id}"
+    return parts
 
 
 def _told(
@@ -221,14 +232,7 @@ def _told(
 ) -> tuple[str, str, list[tuple[str, str]]]:
     # the title, the reason, and the trailers of this operation
     request, changes = decision.request, decision.changes.claims
-    # a shutdown may give up some topics of a claim, which then stays
-    parts = dict[Subject, str]()
-    for change in changes if request.operation == "shutdown" else ():
-        if not (change.before and change.after):
-            continue
-        if lost := sorted(_topics(change.before.held) - _topics(change.after.held)):
-            some = f"topic{'s' if len(lost) > 1 else ''} {', '.join(lost)}"
-            parts[change.key.subject] = f"{some} of {change.key.subject.id}"
+    parts = _given_up_in_part(decision)
     kinds = Counter(each.kind for each in decision.changes.subjects() if each not in parts)
     counts = [(kinds[kind], kind.value[:-1]) for kind in SubjectKind if kinds[kind]]
     counted = (f"{count} {kind}{'s' if count > 1 else ''}" for count, kind in counts)
