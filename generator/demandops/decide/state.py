@@ -131,7 +131,7 @@ class ReleaseChange:
         return f"{self.name} ({self.what}){effect}"
 
 
-_MOST_NAMES = 10
+_MOST_NAMES = 5
 
 
 def effects_of(releases: Collection[ReleaseChange]) -> Iterator[str]:
