@@ -57,7 +57,7 @@ class Kind:
     # The past can be listed of what a trailer of commits names, or of what has a file of this glob.
     trailer: str = ""
     files: str = ""
-    # What an item has that is gone, beside nulls; and what the file tells that a commit removed.
+    # What an item has that is gone, beside nulls; and what its last commit and its file tell of it.
     blank: Json = field(default_factory=dict)
     was: Callable[[Reader, LogEntry, str], Json] = lambda reader, entry, path: {}
 
@@ -109,7 +109,7 @@ def rows_of(source: Source, name: str) -> list[Row]:
 _ENDING = frozenset({"shutdown", "release", "expire", "decommission", "rollback"})
 
 
-def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
+def past_rows(source: Source, name: str) -> tuple[list[Row], str]:  # noqa: PLR0912 - a rule each
     """Return what is gone, the newest first, and the commit where the search ended, if it did.
 
     The newest commit that names a thing which is not there now is the one that ended it. What came
@@ -128,14 +128,12 @@ def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
             return [*map(kind.row, past.values())], entry.commit
         by, time, operation = entry.author, entry.time, entry.first("Operation")
         reason = entry.first("Reason") if operation else entry.why
-        commit, files = entry.commit, removed.get(entry.commit, {})
+        files, rejected = removed.get(entry.commit, {}), entry.trailers.get(REJECTS, ())
         named = entry.trailers.get(kind.trailer, [*files])
         if name == "proposals" and (answer := entry.answer):
             by, time, operation, reason = answer.by, answer.time, answer.outcome, answer.reason
-            if not named:  # of a rejection, the branch and the commit that was proposed
-                branch, _, commit = entry.first(REJECTS).partition(" ")
-                named = [branch]
-        elif REJECTS in entry.trailers:
+            named = named or [each.partition(" ")[0] for each in rejected]
+        elif rejected:
             continue  # what was proposed, and never was there
         for gone in named:
             if gone in began:
@@ -150,11 +148,8 @@ def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
             item["ended"] = {"time": time_data(time), "by": by, "operation": operation or None}
             item["ended"] |= {"reason": reason or None, "commit": entry.commit}
             if gone not in past:
-                item |= (
-                    {"commit": commit, "summary": entry.summary} if kind.word == "proposal" else {}
-                )
-                item |= kind.was(reader, entry, files[gone]) if gone in files else {}
-            item = past.setdefault(gone, item)
+                past[gone] = item | kind.was(reader, entry, files.get(gone, ""))
+            item = past[gone]
             if not kind.files:
                 item["since"] = time_data(entry.time)  # of the oldest commit that names it
             if len(named) == 1 and not item["requesters"]:  # what a commit names is all of it
@@ -672,6 +667,13 @@ def _proposals(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
         yield proposal.branch, ({"name": proposal.branch, **data, "link": link},)
 
 
+def _proposal_was(reader: Reader, entry: LogEntry, path: str) -> Json:
+    # a rejection names the branch and the commit that was proposed
+    commit = entry.first(REJECTS).partition(" ")[2] or entry.commit
+    required = entry.trailers.get("Approval-Required-By", [])
+    return {"commit": commit, "summary": entry.summary, "required_by": required}
+
+
 def _events(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     for entry in islice(source.reader().log(source.commit), MOST_COMMITS):
         yield entry.commit, (event(entry),)
@@ -890,7 +892,7 @@ KINDS: dict[str, Kind] = {
             ),
             _proposals,
             trailer=PROPOSAL,
-            blank={"commit": ""},
+            was=_proposal_was,
         ),
         Kind(
             "events",
