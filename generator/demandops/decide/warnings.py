@@ -16,7 +16,7 @@ from demandops.base.errors import Fault, InvalidInput, fault, suggestion
 from demandops.base.quantities import amount_of, amount_text
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
-from demandops.decide.admission.permission import PEERS, needed_access
+from demandops.decide.admission.permission import PEERS, first_uncovered, needed_access
 from demandops.decide.booking import Drain
 from demandops.decide.checks.collisions import Names, publishers, topics_made
 from demandops.decide.placement.candidates import lacks, requirement_of, unmet
@@ -374,6 +374,7 @@ _MOST_NODES = 3
 
 def policy_warnings(world: State) -> Iterator[Fault]:
     config = world.config
+    yield from _approvals_not_needed(config)
     yield from _open_by_host_network(config)
     yield from _connections_no_longer_allowed(world)
     for (id, resource), used in sorted(world.usage().amounts.items()):
@@ -410,6 +411,23 @@ def policy_warnings(world: State) -> Iterator[Fault]:
             yield fault(field, message).within(file)
     for path, text in following_overrides(world).stays:
         yield fault("node", text).within(path)
+
+
+def _approvals_not_needed(config: Config) -> Iterator[Fault]:
+    fields = ("requesters", "applications", "nodes")
+    for name, domain in sorted(config.domains.items()):
+        free = [rule for rule in domain.rules if not domain.asks(rule)]
+        for rule in filter(domain.asks, domain.rules):
+            # a pattern covers another if it matches it as text, with `*` longer than any `???`
+            needed = [(f, p.replace("*", "*" * 99)) for f in fields for p in getattr(rule, f)]
+            for other in (each for each in free if not first_uncovered(each, needed)):
+                message = (
+                    f"rule '{rule.name}' requires approval, but '{other.name}' covers the same "
+                    "requesters and does not, so nobody is asked; one rule without approval is "
+                    f"enough; narrow '{other.name}', or let it require approval too"
+                )
+                file = config.file_of(DOMAINS_FILE, name)
+                yield fault(f"access domain '{name}'", message).within(file)
 
 
 def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:

@@ -160,7 +160,15 @@ MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "too many placeholders": (
         {"id": "{a}{b}-{c}{d}"},
-        "nodes[1]: '{a}{b}-{c}{d}' has 4 placeholders; write at most three",
+        "nodes[1].id: has 4 placeholders; write at most three",
+    ),
+    "the whole id within the id": (
+        {"id": "car{id}"},
+        "nodes[1].id: {id} stands for the whole id; write another name, such as 'car{n}'",
+    ),
+    "a star for a placeholder": (
+        {"id": "car*"},
+        "nodes[1].id: 'car*' is no id; for a pattern, write 'car{n}'",
     ),
     "no topic": (
         {"topics": {"ego_data": "{id}"}},
