@@ -16,7 +16,6 @@ from demandops.decide.state import State
 from demandops.model.config.load import load
 from demandops.model.demand.demand import Requirement
 from demandops.model.ledger import records
-from demandops.model.ledger.ledger import ClaimChange
 from demandops.model.ledger.records import in_turn
 
 from tests.kit.config import state_of
@@ -106,16 +105,6 @@ def test_the_bookkeeping_has_what_is_requested_of_nodes_with_a_capacity() -> Non
         "west": {"cpu": {"requested": "0", "capacity": "5"}},
     }
     assert "nodes" not in MemoryRepo().bookkeeping()
-
-
-def test_an_edit_by_hand_changes_what_nodes_have_left() -> None:
-    known = full_repo().state
-    known.usage()
-    gone = [claim for claim in known.ledger if claim.is_on_application][:2]
-    ledger = known.ledger.without(gone)
-    edited = known.with_ledger(ledger, [ClaimChange(claim, None) for claim in gone])
-    assert edited.usage().amounts == replace(known, ledger=ledger).usage().amounts
-    assert edited.usage().amounts != known.usage().amounts
 
 
 def test_a_rollback_leaves_what_waits() -> None:

@@ -1,4 +1,7 @@
-"""Nodes and brokers that nobody listed: one entry of the inventory stands for many."""
+"""Nodes and brokers that nobody listed: one entry of the inventory stands for many.
+
+The mistakes in such an entry are in ``config-mistakes.yaml``.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,6 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import InvalidInput
 from demandops.decide.warnings import truth_warnings
 from demandops.model.config.load import load
 from demandops.render import gitops
@@ -118,44 +120,6 @@ def test_a_listed_node_goes_before_a_pattern() -> None:
     own = {"id": "vehicle7", "type": "bus", "cluster": "c-its"}
     config = load(configuration(inventory({"id": "vehicle{n}"} | VEHICLE, own)))
     assert (config.nodes["vehicle7"].type, config.nodes["vehicle8"].type) == ("bus", "vehicle")
-
-
-MISTAKES: dict[str, tuple[dict[str, Any], str]] = {
-    "a placeholder that the id has not": (
-        {"topics": {"ego_data": "/{name}/ego"}},
-        "nodes[1].topics.ego_data: {name} is not in the id 'vehicle{n}'; write one of {id}, {n}",
-    ),
-    "too many placeholders": (
-        {"id": "{a}{b}-{c}{d}"},
-        "nodes[1]: '{a}{b}-{c}{d}' has 4 placeholders; write at most three",
-    ),
-    "no topic": (
-        {"topics": {"ego_data": "{id}"}},
-        "nodes[1].topics.ego_data: 'vehicle1' is not a topic name that ROS 2 allows",
-    ),
-    "an unknown cluster": ({"cluster": "none"}, "nodes[1].cluster: 'none' is not in clusters.yaml"),
-    "a coordinate in quotes": (
-        {"position": {"x": "5", "y": 1}},
-        "nodes[1].position.x: input should be a valid number, not '5'",
-    ),
-    "an unknown input": (
-        {"topics": {"egodata": "/{id}/ego"}},
-        "nodes[1].topics.egodata: 'egodata' is not an input of any application",
-    ),
-    "an unknown domain": (
-        {"accessDomains": [{"name": "none"}]},
-        "nodes[1].accessDomains[0].name: 'none' is not in",
-    ),
-    "an unknown field": ({"topic": {}}, "nodes[1].topic: is not a field here"),
-}
-
-
-@pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_told_before_a_node_is_demanded(name: str) -> None:
-    changed, message = MISTAKES[name]
-    with pytest.raises(InvalidInput) as caught:
-        load(configuration(inventory({"id": "vehicle{n}"} | VEHICLE | changed)))
-    assert message in str(caught.value)
 
 
 @given(st.text(alphabet="{}n$ab-*?[/@.", max_size=12))

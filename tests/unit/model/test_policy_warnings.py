@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,8 +17,8 @@ from tests.kit.config import configuration, state_of
 from tests.kit.memory import MemoryRepo
 from tests.unit.model.test_config_mistakes import APPDEF, changed
 
-CASES = plain_yaml.load(Path(__file__).with_name("policy-warnings.yaml").read_text())
-REQUESTS = plain_yaml.load(Path(__file__).with_name("request-warnings.yaml").read_text())
+CASES = plain_yaml.beside(__file__, "policy-warnings")
+REQUESTS = plain_yaml.beside(__file__, "request-warnings")
 
 
 def told(case: dict[str, Any]) -> list[str]:
