@@ -10,17 +10,16 @@ from demandops.decide.state import ReleaseChange, describe_change, planned_relea
 from demandops.render import gitops
 
 from tests.kit.config import edited, override, skeleton
+from tests.kit.goals import Goal, put
 from tests.kit.memory import MemoryRepo
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 FUSION = "of-edge-fusion-c9b035cdedb8"
 
 
-def demand(vehicle: str) -> dict[str, Any]:
-    topic = {"topic": f"/vehicles/{vehicle}/ego_data", "source": vehicle}
-    app = {"id": "edge/fusion", "type": "object-detection-fusion", "node": "edge"}
-    app |= {"inputs": {"ego_data": [topic]}}
-    return {"kind": "Demand", "demand": vehicle, "requesters": [vehicle], "applications": [app]}
+def demand(vehicle: str) -> Goal:
+    topic = f"/vehicles/{vehicle}/ego_data", vehicle
+    return put(vehicle, vehicle, id="edge/fusion", topic=topic)
 
 
 def effects(repo: MemoryRepo, goal: object) -> dict[str, str]:

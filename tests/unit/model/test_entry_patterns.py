@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from tests.kit.chance import examples
 from tests.kit.config import configuration
+from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
 NODES, BROKERS = "inventory/nodes.yaml", "inventory/brokers.yaml"
@@ -51,13 +52,6 @@ def filled(part: Any, n: str) -> Any:
     return int(n) if part == "{n}" else text
 
 
-def demand_of(node: str) -> dict[str, Any]:
-    topic = {"topic": f"/vehicles/{node}/ego_data", "source": node}
-    app = {"id": "edge/fusion", "type": "object-detection-fusion", "node": "edge"}
-    app |= {"inputs": {"ego_data": [topic]}}
-    return {"kind": "Demand", "demand": node, "requesters": [node], "applications": [app]}
-
-
 def test_a_pattern_means_what_the_entries_would() -> None:
     listed = MemoryRepo(
         inventory(
@@ -68,7 +62,7 @@ def test_a_pattern_means_what_the_entries_would() -> None:
     pattern = MemoryRepo(inventory({"id": "vehicle{n}"} | VEHICLE, brokers=(BROKER,)))
     for node in ("vehicle07", "vehicle8"):
         for repo in (listed, pattern):
-            repo.send(demand_of(node))
+            repo.send(put(node, node, id="fusion", topic=(f"/vehicles/{node}/ego_data", node)))
         for known in (lambda config: config.nodes, lambda config: config.brokers):
             assert known(listed.config)[node] == known(pattern.config)[node]
     differing = {*listed.files.items()} ^ {*pattern.files.items()}
@@ -104,10 +98,7 @@ def test_an_id_gives_exactly_one_valid_node(node: str, reason: str) -> None:
     ]
     policy = {"apiVersion": "demandops/v1", "kind": "AccessDomains", "domains": domains}
     files = inventory(*entries) | {"policy/access-domains.yaml": yaml.safe_dump(policy)}
-    repo = MemoryRepo(files)
-    goal = demand_of("edge") | {"requesters": ["any"]}
-    goal["applications"][0]["inputs"]["ego_data"][0] = {"topic": "/ego", "source": node}
-    assert reason in "\n".join(repo.faults(goal))
+    assert reason in "\n".join(MemoryRepo(files).faults(put("d", "any", topic=("/ego", node))))
 
 
 def test_a_placeholder_is_no_word_of_yaml() -> None:
