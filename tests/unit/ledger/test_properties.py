@@ -10,6 +10,7 @@ from dataclasses import replace
 from datetime import timedelta
 from random import Random
 
+from demandops.decide.booking import Restoration
 from demandops.decide.decision import Decision
 from demandops.decide.state import rendered_files
 from demandops.model.ledger import claim as claim_files
@@ -112,3 +113,18 @@ def test_when_all_have_left_the_repo_is_as_it_was_laid_down(random: Random, coun
     ends = often([shutdown_of(request) for request in requests], random)
     assert {*repo.take_all(ends)} <= {"released", "refused"}, "who has left may say so again"
     assert (repo.state, repo.files) == (MemoryRepo().state, MemoryRepo().files)
+
+
+@examples(9)
+@given(chances, st.integers(0, 12), st.integers(0, 12))
+def test_a_rollback_gives_the_books_and_files_of_then(
+    random: Random, before: int, after: int
+) -> None:
+    repo = MemoryRepo()
+    repo.take_all(told(Maker(random, calm=True).sequence(before)))
+    then, files = repo.state.ledger, dict(repo.files)
+    repo.take_all(told(Maker(random).sequence(after)))
+    back = Restoration(id="back", to="0" * 40, claims=tuple(then), drop_newer=True)
+    decision = repo.send(back)
+    assert (repo.state.ledger.claims, repo.files) == (then.claims, files)
+    assert decision.outcome == ("restored" if decision.files else "unchanged")
