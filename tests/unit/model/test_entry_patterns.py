@@ -5,10 +5,13 @@ The mistakes in such an entry are in ``config-mistakes.yaml``.
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
+import jsonschema_rs
 import pytest
 import yaml
+from demandops.cli.authoring import schema
 from demandops.decide.warnings import truth_warnings
 from demandops.model.config.load import load
 from demandops.render import gitops
@@ -69,6 +72,16 @@ def test_a_pattern_means_what_the_entries_would() -> None:
     assert {path for path, _ in differing} == {NODES, BROKERS}
 
 
+def test_an_editor_accepts_placeholders_in_place_of_any_value() -> None:
+    files = inventory({"id": "vehicle{n}"} | VEHICLE, brokers=({**BROKER, "port": "{n}"},))
+    for path, name in ((NODES, "nodes"), (BROKERS, "brokers")):
+        validator = jsonschema_rs.validator_for(json.loads(schema.text(name)))
+        assert [error.message for error in validator.iter_errors(yaml.safe_load(files[path]))] == []
+        wrong = files[path].replace("'{n}'", "'n'")
+        assert wrong != files[path]
+        assert [*validator.iter_errors(yaml.safe_load(wrong))]
+
+
 REFUSED = {
     "vehicle": "is not in inventory/nodes.yaml",
     "vehicle0 7": "is not in inventory/nodes.yaml",
@@ -99,6 +112,26 @@ def test_an_id_gives_exactly_one_valid_node(node: str, reason: str) -> None:
     policy = {"apiVersion": "demandops/v1", "kind": "AccessDomains", "domains": domains}
     files = inventory(*entries) | {"policy/access-domains.yaml": yaml.safe_dump(policy)}
     assert reason in "\n".join(MemoryRepo(files).faults(put("d", "any", topic=("/ego", node))))
+
+
+@pytest.mark.parametrize(
+    ("node", "reason"),
+    {
+        "v07_a": "'v07_a' matches 'v{n}' in inventory/brokers.yaml: brokers[1] and 'v{n}_a'",
+        "v..7": "'v..7' is no broker of the pattern 'v{n}': inventory/brokers.yaml: ",
+    }.items(),
+)
+def test_no_other_broker_takes_the_place_of_one_that_no_pattern_gives(
+    node: str, reason: str
+) -> None:
+    patterns = ({"node": id, "host": "{id}.fleet"} for id in ("v{n}", "v{n}_a"))
+    nodes = [{"id": f"v{n}", "type": "vehicle", "cluster": "c-its"} for n in (1, "{n}", "{n}_a")]
+    repo = MemoryRepo(inventory(*nodes, brokers=tuple(patterns)))
+    link = {"id": "link", "type": "mqtt", "source": "v1", "target": "edge"}
+    link |= {"broker": node, "topics": [{"source": "/t"}]}
+    demand = {"kind": "Demand", "demand": "d", "requesters": ["v1"], "connections": [link]}
+    assert reason in "\n".join(repo.faults(demand))
+    assert repo.take_all([demand | {"connections": [link | {"broker": "v7"}]}]) == ["booked"]
 
 
 def test_a_placeholder_is_no_word_of_yaml() -> None:
@@ -134,6 +167,6 @@ def test_a_pattern_has_its_namespaces_and_its_part_of_the_rule_of_its_cluster() 
 def test_a_node_of_many_patterns_is_found_among_few() -> None:
     entries = [{"id": f"fleet{i}-{{n}}", "type": "car", "cluster": "c-its"} for i in range(3000)]
     config = load(configuration(inventory(*entries)))
-    assert [pattern for _, pattern in config.unlisted.candidates("fleet77-5")] == [
+    assert [*config.unlisted.patterns.candidates("fleet77-5")] == [
         config.node_patterns["fleet77-{n}"]
     ]

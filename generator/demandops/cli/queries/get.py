@@ -258,7 +258,7 @@ def _refuse_unknown(
     if wanted and not rows:  # then what some kind of thing has is no mistake
         labels = {label for name in KINDS for row in rows_of(source, name) for label in row.labels}
         labels |= {column.key.removesuffix("s") for column in kind.columns} | {*FILTERS, kind.word}
-    asked = [(name, "", {row.item["name"] for row in rows}) for name in names]
+    asked = [(name, kind.word, "", {row.item["name"] for row in rows}) for name in names]
     for label, pattern, option in wanted:
         if label not in labels:
             raise click.UsageError(
@@ -266,11 +266,12 @@ def _refuse_unknown(
             )
         listed = (text for row in rows for text in row.labels.get(label, ()))
         if rows or label in existing:
-            asked.append((pattern, option, {*existing.get(label, ()), *listed}))
+            asked.append((pattern, label, option, {*existing.get(label, ()), *listed}))
     faults = [
         fault(option, f"nothing is called {quoted(pattern)}{suggestion(pattern, candidates)}")
-        for pattern, option, candidates in asked
+        for pattern, label, option, candidates in asked
         if not any(matches(name.casefold(), (pattern.casefold(),)) for name in candidates)
+        and not (label == "node" and config.has_node(pattern))
     ]
     if faults:
         raise InvalidInput(faults)
