@@ -23,7 +23,7 @@ MAIN = "refs/heads/main"
 ROS_BRIDGE = Path(__file__).parents[3] / "ros_bridge"
 WHO = pygit2.Signature("a", "a@example.org", 0, 0)
 NOW = datetime(2026, 1, 31, 12, 0, 30, tzinfo=timezone.utc)
-TABLES = plain_yaml.load(Path(__file__).with_name("revisions.yaml").read_text())
+TABLES = plain_yaml.beside(__file__, "revisions")
 
 
 @pytest.mark.parametrize("text", TABLES["times"])
