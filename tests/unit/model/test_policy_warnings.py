@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,11 +14,12 @@ from demandops.model.config.load import load
 
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, state_of
+from tests.kit.connections import demand, routes
 from tests.kit.memory import MemoryRepo
 from tests.unit.model.test_config_mistakes import APPDEF, changed
 
-CASES = plain_yaml.load(Path(__file__).with_name("policy-warnings.yaml").read_text())
-REQUESTS = plain_yaml.load(Path(__file__).with_name("request-warnings.yaml").read_text())
+CASES = plain_yaml.beside(__file__, "policy-warnings")
+REQUESTS = plain_yaml.beside(__file__, "request-warnings")
 
 
 def told(case: dict[str, Any]) -> list[str]:
@@ -84,8 +84,7 @@ def test_a_live_value_that_does_not_exist_is_told(
 
 def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
     books = MemoryRepo(changed({"base": "two domains"}))
-    link = {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
-    books.send({"kind": "Demand", "demand": "d", "requesters": ["v"], "connections": [link]})
+    books.send(routes(demand()))
     closed = {"base": "two domains", "policy/access-domains.yaml": {"peers: [": "nodes: ["}}
     config = load(configuration(changed(closed)))
     found = map(str, warnings.policy_warnings(state_of(config, books.state.ledger)))
