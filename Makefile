@@ -14,7 +14,7 @@ PACKAGE_TESTS := tests/packages
 PAGE_TESTS := tests/page
 DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
-KILL_TESTS := tests/integration/repo/test_kill_and_restart.py tests/ros/test_crash.py
+KILL_TESTS := tests/ros/test_crash.py
 # What takes long because it has remotes, crashes, ROS, brokers, servers or much work.
 PROCESS_TESTS := tests/ros tests/conformance tests/experiment tests/unit/decide/test_budget.py \
   tests/unit/model/test_thousands_of_entries.py $(addprefix tests/integration/,repo mqtt web \
@@ -113,18 +113,17 @@ faults: system-faults setup  ## Kill generators; inject an error, a kill, a full
 
 E2E := tests/e2e
 E2E_PATH := tests/e2e/test_experiment.py
-# If E2E_KUBECONFIG names a cluster, the tests use that cluster and start no programs of their own.
 e2e: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
-e2e: system-e2e setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests on a real cluster with Flux (tests/e2e/README.md)
-	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools --for flux; fi
+e2e: system-e2e setup go  ## Run the end-to-end tests on a real cluster with Flux (tests/e2e/README.md)
+	@$(PY) -m tests.e2e.rig.tools --for flux
 	@$(PY) -m pytest -p no:cacheprovider $(E2E) -m 'not argocd' -q
 
 e2e-path: E2E := $(E2E_PATH)
 e2e-path: e2e  ## Run one end-to-end path with Flux: demands become pods, change them and take them away
 
 e2e-argocd: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
-e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests with Argo CD
-	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools; fi
+e2e-argocd: system-e2e-argocd setup go  ## Run the end-to-end tests with Argo CD
+	@$(PY) -m tests.e2e.rig.tools
 	@$(PY) -m pytest -p no:cacheprovider tests/e2e -m argocd -q
 
 # With FIGURES=1 the target also draws the plots of the docs: docs/figures

@@ -17,7 +17,7 @@ from demandops_ros import DemandClient
 
 from tests.e2e.common.expected import CLUSTER, NODES
 from tests.e2e.common.intrusion import FILE, NEIGHBOUR, withdraw
-from tests.e2e.common.world import DOMAINS, World, running
+from tests.e2e.common.world import DOMAINS, World
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Manifest, build_manifest
 from tests.e2e.rig.tools import Report
@@ -74,7 +74,7 @@ def gitops(request: pytest.FixtureRequest) -> Gitops:
 def rig(gitops: Gitops, tmp_path_factory: pytest.TempPathFactory, say: Report) -> Iterator[Rig]:
     """One cluster for all tests with a controller."""
     folder = tmp_path_factory.mktemp(f"rig-{gitops}")
-    with running(Rig(CLUSTER, folder, gitops=gitops, nodes=NODES, report=say)) as rig:
+    with Rig(CLUSTER, folder, gitops=gitops, nodes=NODES, report=say) as rig:
         yield rig
 
 

@@ -10,14 +10,12 @@ from tests.e2e.common import expected
 from tests.e2e.common.domain import Domain
 from tests.e2e.common.expected import STEPS
 from tests.e2e.common.world import World
-from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
 Act = Callable[[World, dict[str, Any]], None]
 
 
-def test_eight_steps_with_a_kill_in_each(world: World, rig: Rig, say: Report) -> None:
-    assert rig.parts
+def test_eight_steps_with_a_kill_in_each(world: World, say: Report) -> None:
     domain = world.domain
     at_first = domain.inventory()
     for step in STEPS:
@@ -89,7 +87,7 @@ def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
     world.rig.parts.pause("git")
     try:
         send_until_committed(world, goal)
-        world.domain.kube.wait("a push", lambda: pushes(world.push_url))
+        world.domain.kube.wait("a push", lambda: pushes(world.url))
         world.generator.kill()
     finally:
         world.rig.parts.resume("git")

@@ -143,7 +143,6 @@ class Deployed:
 def deployed(
     rig: Rig, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Deployed]:
-    assert rig.parts  # else real kubelets start the pods
     if os.geteuid():
         pytest.skip("only root can start a container")
     folder = tmp_path_factory.mktemp("deployed")

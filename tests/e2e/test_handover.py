@@ -11,7 +11,7 @@ from tests.e2e.common.argocd import ArgoDomain
 from tests.e2e.common.domain import name_of
 from tests.e2e.common.expected import CLUSTER, NODES
 from tests.e2e.common.flux import FluxDomain
-from tests.e2e.common.world import World, running
+from tests.e2e.common.world import World
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.components import ARGOCD as CONTROL
 from tests.e2e.rig.tools import Report
@@ -23,7 +23,7 @@ SUSPENDED = {"spec": {"suspend": True}}
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory, say: Report) -> Iterator[Rig]:
     folder = tmp_path_factory.mktemp("rig")
-    with running(Rig("both", folder, beside="argocd", nodes=NODES, report=say)) as rig:
+    with Rig("both", folder, beside="argocd", nodes=NODES, report=say) as rig:
         yield rig
 
 

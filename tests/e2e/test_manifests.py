@@ -18,7 +18,6 @@ from demandops.repo.merge_check.rendered_charts import HELM_BIN
 from tests.e2e.common.expected import NAMESPACE
 from tests.e2e.common.rendered import DETECTION_TEMPLATE, check_chart
 from tests.e2e.rig.cluster import Gitops, Rig
-from tests.e2e.rig.components import KINDS
 from tests.e2e.rig.kube import Manifest, build_manifest
 from tests.golden.cases import CASES, whole
 from tests.kit.cli import Run
@@ -27,6 +26,10 @@ from tests.unit.render.test_yaml_as_helm import HELM_READS
 
 ROOT = Path(__file__).resolve().parents[2]
 APPDEFS = (ROOT / "appdefs", ROOT / "examples" / "lane-detection" / "appdefs")
+KINDS = {
+    "flux": ("GitRepository", "Kustomization", "HelmRelease"),
+    "argocd": ("Application", "AppProject"),
+}
 CHARTS = {
     "object-detection": "object-detection-fusion/charts/object-detection",
     "object-fusion": "object-detection-fusion/charts/object-fusion",
@@ -120,7 +123,7 @@ def test_helm_reads_scalars_as_recorded_and_texts_as_we_write_them(
 def test_check_renders_each_application_and_names_what_helm_refuses(
     rig: Rig, checkout: Path, demandops: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(HELM_BIN, str(rig.helm_program()))
+    monkeypatch.setenv(HELM_BIN, str(rig.helm_program))
     rendered = "charts rendered by helm: object-detection, object-fusion"
     checked = demandops("check", checkout, "--require-helm")
     assert (checked.code, checked.err) == (0, "")

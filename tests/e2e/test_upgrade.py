@@ -58,11 +58,11 @@ def test_an_upgrade_from_the_second_version_restarts_nothing_that_stays(
     world = make_world()
     git(tmp_path, "clone", "--quiet", "--bare", str(SECOND), "second.git")
     left = "before-faults^{commit}:refs/heads/main"
-    git(tmp_path / "second.git", "push", "--quiet", "--force", world.push_url, left)
+    git(tmp_path / "second.git", "push", "--quiet", "--force", world.url, left)
     manifests = world.manifests(CLUSTER)
     for item in manifests:
         if item["kind"] == "GitRepository":
-            item["spec"]["url"] = rig.git_url(world.name)
+            item["spec"]["url"] = world.url
     world.domains = {domain.namespace: domain for domain in world.lay_down(rig, manifests)}
     domain = world.domains[NAMESPACE]
     domain.settle(world.tip())

@@ -109,7 +109,7 @@ def test_a_call_with_another_signature_or_none_is_refused(
     world: World, rig: Rig, secret: bytes | None
 ) -> None:
     url = f"{rig.parts.url(ARGOCD_SERVER)}/api/webhook"
-    pushed = (rig.git_url(world.name), "", world.tip(), None)
+    pushed = (world.url, "", world.tip(), None)
     with pytest.raises(NoAnswer, match=r"^it answered 400$"):
         reconcile_trigger.call_argocd(url, secret, *pushed)
     reconcile_trigger.call_argocd(url, WEBHOOK_SECRET.encode(), *pushed)

@@ -54,7 +54,7 @@ def serving(root: Path, prefix: str = "") -> Iterator[Server]:
     class Serving(_Handler):
         ordered = server, prefix
 
-    with running(githttp.GitServer(root, "127.0.0.1", 0, Serving)) as url:
+    with running(githttp.GitServer(root, 0, Serving)) as url:
         server.url = f"{url}{prefix}"
         yield server
 

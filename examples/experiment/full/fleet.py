@@ -37,7 +37,8 @@ def files(
     registry: dict[str, Any] = yaml.safe_load(images)
     registry["images"]["zenoh-bridge"] = _BRIDGE
     for node in inventory["nodes"]:
-        node["ros"]["domainId"] = domains[node["id"]]
+        if node["id"] in domains:  # a pattern has its own
+            node["ros"]["domainId"] = domains[node["id"]]
         edge = {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
         node["zenoh"] = edge if node["id"] == "edge" else {}
     brokers = [{"node": node, "host": "127.0.0.1", "port": port} for node, port in ports.items()]

@@ -27,6 +27,7 @@ class Settings:
     vanish: str = ""
     bag: str = ""
     large: int = 0
+    unlisted: int = 0
     tracks: tuple[Way, ...] = ()
 
     def routes(self) -> tuple[Way, ...]:
@@ -77,6 +78,7 @@ class Outcome:
     inputs: list[tuple[float, frozenset[str]]] = field(default_factory=list)
     tracks: list[tuple[float, list[tuple[float, float]]]] = field(default_factory=list)
     arrivals: dict[str, list[float]] = field(default_factory=dict)
+    delivered: dict[str, list[float]] = field(default_factory=dict)
     carried: dict[str, int] = field(default_factory=dict)
     crossings: tuple[Near, ...] = ()
     """All intersections of the larger experiment; empty in the paper's experiment."""

@@ -139,14 +139,24 @@ def one(seed: int, gap: float) -> tuple[Route, ...]:
 
 def many(seed: int, count: int) -> tuple[Route, ...]:
     """Return routes through ``MIDDLES``; every ``SPACING_S`` s one enters, at 20 to 50 km/h."""
+    return passing(seed, [f"vehicle{number:03}" for number in range(count)], SPACING_S, MIDDLES)
+
+
+def passing(
+    seed: int,
+    vehicles: Sequence[str],
+    spacing: float,
+    middles: Sequence[tuple[float, float]] = MIDDLES[:1],
+) -> tuple[Route, ...]:
+    """Return routes of vehicles that enter one after the other, ``spacing`` seconds apart."""
     chance = random.Random(seed)
     found = []
-    for number in range(count):
-        enters = (number + 1 + chance.uniform(-_JITTER, _JITTER)) * SPACING_S
+    for number, vehicle in enumerate(vehicles):
+        enters = (number + 1 + chance.uniform(-_JITTER, _JITTER)) * spacing
         leaves = enters + 2 * RADIUS_M / (chance.uniform(20, 50) / 3.6)
         arms = chance.sample(_ARMS, 2)
-        middle = chance.choice(MIDDLES)
-        found.append(Route(f"vehicle{number:03}", enters, leaves, *arms, middle=middle))
+        middle = chance.choice(middles)
+        found.append(Route(vehicle, enters, leaves, *arms, middle=middle))
     return tuple(found)
 
 

@@ -12,6 +12,7 @@ from zoneinfo import ZoneInfo
 from pydantic import Field, field_validator, model_validator
 
 from demandops.base.naming import topic_problem
+from demandops.base.placeholders import values_in
 from demandops.base.quoting import quoted
 from demandops.model.config.base_model import CamelModel, DnsLabel, Positive, readable_by, without
 from demandops.model.config.inventory import Position
@@ -19,7 +20,7 @@ from demandops.model.config.inventory import Position
 # ---- patterns of topics, such as ``/vehicles/{entity}/pose`` ----
 
 ENTITY = "{entity}"
-_PART = r"(?P<entity>[A-Za-z0-9_]+)"
+_PART = "[A-Za-z0-9_]+"
 
 
 def topic_pattern_problem(pattern: str) -> str:
@@ -31,11 +32,8 @@ def topic_pattern_problem(pattern: str) -> str:
 
 def entity_in(pattern: str, topic: str) -> str | None:
     """Return the entity that ``topic`` names, ``""`` if none, ``None`` if it does not match."""
-    before, entity, after = pattern.partition(ENTITY)
-    if not entity:
-        return "" if topic == pattern else None
-    matched = re.fullmatch(f"{re.escape(before)}{_PART}{re.escape(after)}", topic)
-    return matched["entity"] if matched else None
+    values = values_in(pattern, topic, _PART)
+    return None if values is None else values.get("entity", "")
 
 
 # ---- the conditions of rules: distances, counts, limits and hours ----

@@ -13,8 +13,9 @@ from statistics import median
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
+from demandops.base.placeholders import VALUE
 from demandops.detect.condition import Count, Hours, Near, Threshold, Together
-from demandops.detect.rule_file import Rule, RuleFile, Who, is_entity
+from demandops.detect.rule_file import Rule, RuleFile, Who
 from demandops.model.config.base_model import seconds_of
 
 # ---- the engine's state between two steps: who was seen where, which events have not ended ----
@@ -166,7 +167,7 @@ class MessageReader:
                 return None
         if self._entity:
             entity = str(self._entity(message)).strip("/")
-            if not is_entity(entity):
+            if not re.fullmatch(VALUE, entity):
                 raise Unreadable(f"{entity[:60]!r} is not a name of an entity")
         position = None
         if self._position and self._place:

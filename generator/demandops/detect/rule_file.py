@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +13,7 @@ from pydantic import Field, model_validator
 
 from demandops.base.errors import Fault, InvalidInput, fault, suggestion
 from demandops.base.naming import message_type_problem
+from demandops.base.placeholders import filled, names, texts, values_in
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.base.strict_yaml import located_in
@@ -25,86 +25,8 @@ from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, I
 from demandops.model.config.policy import Duration, Patterns
 from demandops.model.demand.goals import form_faults
 
-# ---- the template of a demand: plain data in whose texts ``{entity}`` stands for a value ----
-#
-# A text that is only a name in braces becomes the value itself, for example a number for ``{x}``.
-# ``{{`` and ``}}`` stand for single braces. A template has no expressions, attributes or formats.
-
-# The values of the names in a template.
+# The values of the placeholders in a demand
 Values = Mapping[str, str | float]
-
-_TOKEN = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
-# The pattern of an entity's name.
-_ENTITY = r"[A-Za-z0-9_.-]+"
-
-
-def is_entity(name: str) -> bool:
-    return bool(re.fullmatch(_ENTITY, name))
-
-
-def filled(template: Any, values: Values) -> Any:  # noqa: ANN401 - plain data
-    """Return the template with values for names in braces; raise KeyError for a name without."""
-    # The template is parsed already, so a value cannot change the structure of the demand.
-    if isinstance(template, str):
-        alone = _TOKEN.fullmatch(template)
-        if alone and alone[1] is not None:
-            return values[alone[1]]
-        return _TOKEN.sub(
-            lambda token: token[0][0] if token[1] is None else str(values[token[1]]), template
-        )
-    if isinstance(template, Mapping):
-        return {str(filled(key, values)): filled(value, values) for key, value in template.items()}
-    if isinstance(template, list | tuple):
-        return [filled(item, values) for item in template]
-    return template
-
-
-def texts(template: Any, field: str) -> Iterator[tuple[str, str]]:  # noqa: ANN401
-    """Yield (path, text) for each text and each key in a template at the path ``field``."""
-    if isinstance(template, str):
-        yield field, template
-    elif isinstance(template, Mapping):
-        for key, value in template.items():
-            yield f"{field}.{key}", key
-            yield from texts(value, f"{field}.{key}")
-    elif isinstance(template, list | tuple):
-        for index, item in enumerate(template):
-            yield from texts(item, f"{field}[{index}]")
-
-
-def names(text: str) -> set[str]:
-    return {token[1] for token in _TOKEN.finditer(text) if token[1] is not None}
-
-
-def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: ANN401
-    """Return a fault for each unknown name in braces, and for each single brace."""
-    problems = []
-    for path, text in texts(template, field):
-        for token in _TOKEN.finditer(text):
-            if token[0] in ("{", "}"):
-                message = f"has a single '{token[0]}'; write '{token[0] * 2}' for one brace"
-                problems.append(fault(path, message))
-            elif token[1] is not None and token[1] not in known:
-                message = f"'{{{token[1]}}}' has no value here"
-                problems.append(fault(path, message + suggestion(token[1], known)))
-    return problems
-
-
-def candidates(template: str, text: str) -> Mapping[str, str]:
-    """Return entities that turn the template into ``text``, by name; empty if none do."""
-    seen: set[str] = set()
-    pattern, end = "", 0
-    for token in _TOKEN.finditer(template):
-        pattern += re.escape(template[end : token.start()])
-        end = token.end()
-        if token[1] is None:
-            pattern += re.escape(token[0][0])
-        else:
-            pattern += f"(?P={token[1]})" if token[1] in seen else f"(?P<{token[1]}>{_ENTITY})"
-            seen.add(token[1])
-    matched = re.fullmatch(pattern + re.escape(template[end:]), text)
-    return matched.groupdict() if matched else {}
-
 
 # ---- what a rule demands: a template for goals that start, renew and end a demand ----
 #
@@ -159,7 +81,7 @@ class Goal:
         return Goal(self.action, filled(self.data, values))
 
     def names(self) -> set[str]:
-        return {name for _, text in texts(self.data, "") for name in names(text)}
+        return {name for _, text in texts(self.data) for name in names(text)}
 
     def outline(self, values: Values) -> Goal:
         """Return a goal that suffices to end the demand, and starts it if no value is missing."""
@@ -180,7 +102,7 @@ class Goal:
         pairs = [(self.id, booked_id), *product(self.requesters, requesters)]
         entities: dict[str, set[str]] = {name: set() for name in subjects}
         for template, text in pairs:
-            for name, entity in candidates(template, text).items():
+            for name, entity in (values_in(template, text) or {}).items():
                 entities.get(name, set()).add(entity)
         for combination in product(*(sorted(entities[name]) for name in subjects)):
             values = dict(zip(subjects, combination, strict=True))
@@ -228,7 +150,13 @@ def faults_of_demand(
     # A ``DeploymentRequest`` is sent again to renew it and with ``shutdown`` to end it. It must be
     # the same then, also after a restart, when momentary values are not known.
     known = {"rule", *subjects, *(momentary if template.action == "Demand" else ())}
-    if problems := faults(template.data, field, known):
+    problems = [
+        fault(path, f"'{{{name}}}' has no value here{suggestion(name, known)}")
+        for path, text in texts(template.data, field)
+        for name in names(text)
+        if name not in known
+    ]
+    if problems:
         return problems
     data = filled(template.data, _SAMPLE)
     if template.action == "Demand":
@@ -264,7 +192,7 @@ def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fau
         listed: list[tuple[str, Sequence[str]]] = [("demand", [data.get("demand", "")])]
         for name, what in (("demand", "id"), ("requesters", "requesters")):
             for path, text in texts(data.get(name, ()), f"{field}.{name}"):
-                if changing := sorted(names(text) - {"rule", "entity", "other"}):
+                if changing := sorted({*names(text)} - {"rule", "entity", "other"}):
                     message = (
                         f"'{{{changing[0]}}}' changes, but the demand's {what} must stay the same; "
                     )

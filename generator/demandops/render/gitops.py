@@ -13,10 +13,10 @@ from typing import Any
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput, Refused
+from demandops.base.placeholders import any_value_of, is_pattern
 from demandops.base.settings import MAIN_BRANCH
 from demandops.connections.connection import UNSUPPORTED
 from demandops.model.config.config import IMAGES_FILE, Config
-from demandops.model.config.entry_patterns import any_value_of, is_pattern
 from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.override import format_time
 from demandops.model.config.policy import AccessDomain

@@ -27,8 +27,8 @@ from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.ledger.records import in_turn
 from demandops.repo.write.commit_batch import CommitBatch
-from demandops.serve.node_discovery import NodeDiscovery
 from demandops.serve.journal import Receipt, Ticket
+from demandops.serve.node_discovery import NodeDiscovery
 
 log = logging.getLogger("demandops")
 

@@ -26,8 +26,8 @@ from demandops.serve import agenda
 from demandops.serve.agenda import Agenda, Backoff, RateLimit, What
 from demandops.serve.approvals import Approvals, Result, commit_without_files
 from demandops.serve.demands import Demands
-from demandops.serve.node_discovery import NodesOf
 from demandops.serve.journal import Receipt, Ticket
+from demandops.serve.node_discovery import NodesOf
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 log = logging.getLogger("demandops")

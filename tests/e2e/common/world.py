@@ -10,8 +10,7 @@ import signal
 import subprocess
 import sys
 import uuid
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from tests.kit.ros import Client, Sent, Served, Servers
 
 from .argocd import ArgoDomain
 from .domain import Domain
-from .expected import CLUSTER, NAMESPACE, WITHOUT_DEMANDS, demand
+from .expected import CLUSTER, WITHOUT_DEMANDS, demand
 from .flux import FluxDomain
 
 DOMAINS: dict[Gitops, type[Domain]] = {"flux": FluxDomain, "argocd": ArgoDomain}
@@ -57,13 +56,12 @@ class World:
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
         self.rig, self.client, self.folder = rig, client, folder
         self.name = f"state-{uuid.uuid4().hex[:8]}.git"
-        self.push_url = rig.push_url(self.name)
+        self.url = rig.git_url(self.name)
         bare = folder / "state.git"
-        url = rig.git_url(self.name)
-        demandops(folder, "init", str(bare), "--bare", "--gitops", rig.gitops, "--url", url)
-        git(bare, "push", "--quiet", self.push_url, "main")
-        self.person = Person(self.push_url, folder / "person")
-        self.generator = Generator(self.push_url, folder, ros_domain, client)
+        demandops(folder, "init", str(bare), "--bare", "--gitops", rig.gitops, "--url", self.url)
+        git(bare, "push", "--quiet", self.url, "main")
+        self.person = Person(self.url, folder / "person")
+        self.generator = Generator(self.url, folder, ros_domain, client)
         self.domains: dict[str, Any] = {}
         self._wide: list[tuple[Kube, Manifest]] = []
 
@@ -149,7 +147,7 @@ class World:
 
     def demandops(self, command: str, *arguments: str, or_exit: int = 0) -> str:
         """Run a command on the state repo, which may exit with `or_exit`; return its output."""
-        words = (command, "--state-repo", self.push_url, *arguments)
+        words = (command, "--state-repo", self.url, *arguments)
         return demandops(self.folder, *words, or_exit=or_exit)
 
     def upgrade(self, gitops: Gitops | None = None) -> str:
@@ -172,15 +170,6 @@ class World:
         """Wait until the cluster has applied a goal's commit, and its `lines` are as wanted."""
         self.domain.follow(sent.commit)
         self.domain.wait_lines(wanted)
-
-
-@contextmanager
-def running(rig: Rig) -> Iterator[Rig]:
-    """Start a rig and stop it after the block; what the tests created in a cluster goes."""
-    with rig:
-        yield rig
-        if rig.existing:
-            rig.kube.delete("Namespace", NAMESPACE)
 
 
 def demandops(folder: Path, *arguments: str, or_exit: int = 0) -> str:

@@ -3,24 +3,20 @@
     with Rig("edge", folder, nodes=["edge"]) as rig:
         rig.kube.apply(...)
 
-Only this module knows the order in which the parts start. If the environment names an existing
-cluster (see `settings`), the rig starts nothing and represents that cluster.
+Only this module knows the order in which the parts start.
 """
 
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Literal
 
-import pytest
-
-from . import RigError, githttp, pki, settings, tools
-from .components import KINDS, Components, prerequisites
+from . import RigError, githttp, pki, tools
+from .components import Components, prerequisites
 from .kube import Kube, Manifest, build_manifest
 from .net import answers, free_port, url
 from .processes import Component, Processes
@@ -37,7 +33,7 @@ class Rig:
     """A cluster; several can run at once, each with its own ports and folder.
 
     Args:
-        name: the rig's name, as in E2E_KUBECONFIG_<NAME>.
+        name: the cluster's name in the kubeconfig.
         folder: what it keeps: data, logs, and the repositories of its Git server.
         gitops: the GitOps controller.
         beside: a second GitOps controller.
@@ -49,6 +45,7 @@ class Rig:
 
     kube: Kube
     kubeconfig: Path
+    parts: Processes
 
     def __init__(
         self,
@@ -63,28 +60,16 @@ class Rig:
     ) -> None:
         self.name, self.gitops, self._folder = name, gitops, folder
         self._controllers = tuple(dict.fromkeys([gitops, beside or gitops]))
-        self.existing = settings.existing(name)
         self._report = report
         self._repositories = (git_of or self)._folder / "git"
         self._nodes = [_fake_node(node_id) for node_id in nodes]
         self._binaries: dict[str, Path] = {}
-        self._git_url = self._push_url = ""
-        self._parts: Processes | None = None
-
-    @property
-    def parts(self) -> Processes:
-        """The programs of the cluster; a test that needs them skips one that is not the rig's."""
-        if self._parts is None:
-            pytest.skip("the tests do not touch the programs of an existing cluster")
-        return self._parts
+        self._git_url = ""
 
     def __enter__(self) -> Rig:
         """Start everything and wait until it is ready; stop everything on failure."""
         try:
-            if self.existing:
-                self._adopt(self.existing)
-            else:
-                self._start_own()
+            self._start()
             self.kube.apply(*self._nodes)
             for node in self._nodes:
                 self.kube.wait_ready("Node", node["metadata"]["name"])
@@ -94,77 +79,48 @@ class Rig:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self.existing:
-            for node in self._nodes:  # a cluster that the rig started goes as a whole
-                self.kube.delete("Node", node["metadata"]["name"])
         self.stop()
 
     def stop(self) -> None:
         if hasattr(self, "kube"):
             self.kube.close()
-        if self._parts:
-            self._parts.stop_all()
+        if hasattr(self, "parts"):
+            self.parts.stop_all()
 
     # --- what tests use ---------------------------------------------------------------------
-
-    def check(self) -> None:
-        """Raise RigError if a part has ended by itself."""
-        if self._parts:
-            self._parts.check()
 
     def git_url(self, repository: str) -> str:
         return f"{self._git_url}/{repository}"
 
-    def push_url(self, repository: str) -> str:
-        """Return the URL by which a test pushes to a repository."""
-        return f"{self._push_url}/{repository}"
-
     def repository(self, name: str) -> Path:
-        assert not self.existing
         return self._repositories / name
 
     def helm(self, *arguments: str) -> str:
-        # The kubeconfig of an existing cluster may call a login command that needs the environment.
-        clean = dict(os.environ) if self.existing else self._environment()
-        environment = clean | {"KUBECONFIG": str(self.kubeconfig)}
-        command = [str(self.helm_program()), *arguments]
+        environment = self._environment() | {"KUBECONFIG": str(self.kubeconfig)}
+        command = [str(self.helm_program), *arguments]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise RigError(f"helm {' '.join(arguments)}: {done.stderr.strip()}")
         return done.stdout
 
+    @property
     def helm_program(self) -> Path:
-        """Return the path of the helm command; build it first if it is missing."""
-        found = self._binaries.get("helm") or shutil.which("helm")
-        if found is None:
-            found = self._binaries["helm"] = tools.ensure(["helm"], self._report)["helm"]
-        return Path(found)
+        return self._binaries["helm"]
 
     # --- starting ---------------------------------------------------------------------------
 
-    def _adopt(self, existing: settings.Existing) -> None:
-        self.kubeconfig = existing.kubeconfig
-        self._git_url, self._push_url = existing.git_url, existing.push_url
-        self.kube = Kube(existing.kubeconfig, self._folder / "discovery.json")
-        for kind in (kind for controller in self._controllers for kind in KINDS[controller]):
-            try:
-                self.kube.find(kind)
-            except Exception as error:
-                remedy = f"set {' and '.join(self._controllers)} up there first, as docs/ says"
-                raise RigError(f"{existing.kubeconfig}: no {kind}s: {error}; {remedy}") from error
-
-    def _start_own(self) -> None:
+    def _start(self) -> None:
         self._binaries = tools.ensure(tools.needed_with(*self._controllers), self._report)
         folder, port = self._folder, free_port()
-        self._git_url = self._push_url = url(port)
-        running = self._parts = Processes(folder / "logs", self._environment())
+        self._git_url = url(port)
+        running = self.parts = Processes(folder / "logs", self._environment())
         certificates = pki.make(folder / "pki")
         parts = Components(self._binaries, folder, certificates)
         running.start_together([*parts.of("store"), git_server("git", self._repositories, port)])
         running.start_together(parts.of("api"))
         self.kubeconfig, server = parts["kubeconfig"], url(parts["api_port"], "https")
         pki.write_kubeconfig(self.kubeconfig, self.name, server, certificates)
-        self.kube = Kube(self.kubeconfig, folder / "discovery.json", self.check)
+        self.kube = Kube(self.kubeconfig, folder / "discovery.json", running.check)
         self.kube.install_crds(tools.crd_files(self._binaries))
         started = [*parts.of("control")]
         for controller in self._controllers:

@@ -22,11 +22,6 @@ ARGOCD = "argocd"  # its namespace
 ARGOCD_SERVER = "argocd-server"
 WEBHOOK_SECRET = secrets.token_hex(16)
 """The secret that signs calls of Argo CD's webhook."""
-KINDS = {
-    "flux": ("GitRepository", "Kustomization", "HelmRelease"),
-    "argocd": ("Application", "AppProject"),
-}
-"""The kinds that tell whether a cluster has a GitOps controller."""
 _HERE = Path(__file__).resolve().parent
 _TABLE: dict[str, Any] = yaml.safe_load((_HERE / "components.yaml").read_text())
 

@@ -44,8 +44,8 @@ class GitServer(ThreadingHTTPServer):
     daemon_threads = True
     request_queue_size = 128
 
-    def __init__(self, root: Path, address: str, port: int, handler: type[Handler]) -> None:
-        super().__init__((address, port), handler)
+    def __init__(self, root: Path, port: int, handler: type[Handler]) -> None:
+        super().__init__(("127.0.0.1", port), handler)
         self.root = root.resolve()
         user, password = os.environ.get(USER_VARIABLE), os.environ.get(PASSWORD_VARIABLE)
         self.expected = ""
@@ -168,10 +168,9 @@ def _main() -> None:
     parser = argparse.ArgumentParser(description="serve the Git repositories below a folder")
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--port", type=int, required=True)
-    parser.add_argument("--address", default="127.0.0.1", help="where to listen")
     options = parser.parse_args()
     options.root.mkdir(parents=True, exist_ok=True)
-    server = GitServer(options.root, options.address, options.port, Handler)
+    server = GitServer(options.root, options.port, Handler)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     server.serve_forever(poll_interval=0.2)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,7 +16,7 @@ from demandops.connections import connection_types
 
 from tests.kit import plain_yaml
 
-DECLARED = plain_yaml.load((Path(__file__).parent / "declared.yaml").read_text())
+DECLARED = plain_yaml.beside(__file__, "declared")
 TYPES = {"string": "str", "integer": "int", "boolean": "bool", "number": "float"}
 
 

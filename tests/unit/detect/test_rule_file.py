@@ -21,7 +21,7 @@ from tests.kit.detection import SOURCES, demand, rule, text_of
 
 ROOT = Path(__file__).parents[3]
 NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
-MISTAKES = plain_yaml.load(Path(__file__).with_name("mistakes.yaml").read_text())
+MISTAKES = plain_yaml.beside(__file__, "mistakes")
 
 
 def faults(text: str) -> tuple[Fault, ...]:
@@ -72,13 +72,15 @@ def test_the_mistakes_of_the_documentation_are_told_as_it_says() -> None:
 
 
 def test_a_value_cannot_change_the_form_of_a_demand() -> None:
-    named = demand(request='{entity}", "x": {{}}', positions=[{"node": "{entity}", "x": "{x}"}])
+    named = demand(
+        request='{entity}", "x": {}, ${entity}', positions=[{"node": "{entity}", "x": "{x}"}]
+    )
     file = rule_file.read(text_of(rule("a", near=NEAR, demand=named)), "rules.yaml")
     goal = file.rules[0].template.filled({"rule": "a", "entity": "{y}", "x": 1.5})
     assert goal.data == {
         "demand": "a/{y}",
         "requesters": ["{y}"],
-        "request": '{y}", "x": {}',
+        "request": '{y}", "x": {}, ${entity}',
         "positions": [{"node": "{y}", "x": 1.5}],
     }
 

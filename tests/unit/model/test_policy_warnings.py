@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,11 +14,12 @@ from demandops.model.config.load import load
 
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, state_of
+from tests.kit.connections import demand, routes
 from tests.kit.memory import MemoryRepo
 from tests.unit.model.test_config_mistakes import APPDEF, changed
 
-CASES = plain_yaml.load(Path(__file__).with_name("policy-warnings.yaml").read_text())
-REQUESTS = plain_yaml.load(Path(__file__).with_name("request-warnings.yaml").read_text())
+CASES = plain_yaml.beside(__file__, "policy-warnings")
+REQUESTS = plain_yaml.beside(__file__, "request-warnings")
 
 
 def told(case: dict[str, Any]) -> list[str]:
@@ -46,10 +46,45 @@ def test_requests_that_no_node_or_pod_has_are_told(name: str) -> None:
         assert words in one
 
 
+_VALUES = "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"
+_CHART = "appdefs/object-detection-fusion/charts/object-fusion/values.yaml"
+
+
+@pytest.mark.parametrize(
+    ("live", "changes", "words"),
+    [
+        ("inputs", {}, []),
+        ("serviceAccount", {}, []),  # of the chart
+        ("parameters", {}, []),  # of its library
+        ("input", {}, ["'input' is no value that", "did you mean 'inputs'?"]),
+        ("seldom", {}, ["'seldom' is no value that appdefs/", "correct it, or remove it"]),
+        (
+            "seldom",
+            {_VALUES: {"inputs:": "…\n{% if false %}\nseldom: 1\n{% endif %}\ninputs:"}},
+            [],
+        ),
+        (
+            "parameters",
+            {_VALUES: {"inputs:": "reconfigure: restart\n…"}},
+            ["write `reconfigure: live`"],
+        ),
+        ("parameters", {_CHART: {"inputs:": "reconfigure: restart\n…"}}, ["restarts the pods, as"]),
+    ],
+)
+def test_a_live_value_that_does_not_exist_is_told(
+    live: str, changes: dict[str, Any], words: list[str]
+) -> None:
+    state = MemoryRepo(changed({**changes, APPDEF: {"live: [inputs]": f"live: [{live}]"}})).state
+    told = [*map(str, warnings.live_warnings(state))]
+    assert len(told) == bool(words)
+    for text in told:
+        assert text.startswith(f"{APPDEF}: services.object-fusion.live: ")
+        assert all(word in text for word in words), text
+
+
 def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
     books = MemoryRepo(changed({"base": "two domains"}))
-    link = {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
-    books.send({"kind": "Demand", "demand": "d", "requesters": ["v"], "connections": [link]})
+    books.send(routes(demand()))
     closed = {"base": "two domains", "policy/access-domains.yaml": {"peers: [": "nodes: ["}}
     config = load(configuration(changed(closed)))
     found = map(str, warnings.policy_warnings(state_of(config, books.state.ledger)))

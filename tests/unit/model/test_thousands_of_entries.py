@@ -6,7 +6,6 @@ Work is counted in calls of functions, so the tests need no clock.
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,7 +18,7 @@ from tests.kit.config import configuration, override
 from tests.unit.decide.test_budget import counted
 
 Files = dict[str, str]
-MANY = plain_yaml.load(Path(__file__).with_name("many-entries.yaml").read_text())
+MANY = plain_yaml.beside(__file__, "many-entries")
 
 
 def files_of(kind: str, count: int) -> Files:

@@ -28,9 +28,10 @@ from demandops.cli.target import all_names, names_of
 from demandops.decide.booking import Drain
 from demandops.decide.placement import relocation
 from demandops.decide.state import State
-from demandops.model.config.base_model import document, matches, parse_file, parse_time, seconds_of
+from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
 from demandops.model.config.config import NODES_FILE
 from demandops.model.config.discovered import is_discovered
+from demandops.model.config.entry_patterns import may_match
 from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
@@ -206,7 +207,7 @@ def _create(
     options: Options,
 ) -> None:
     with writable(options) as repo:
-        options.require_reason()
+        options = options.with_reason()
         if not (chosen := selector(selected)):
             raise click.UsageError("select what the override applies to, for example --node edge")
         if repo.file_reader()(_path_of(name)) is not None:
@@ -218,7 +219,7 @@ def _create(
             is_open = kind in ("applications", "connections", "requesters")
             names = [*all_names(repo, kind)]
             for pattern in patterns if not (is_open and fields.get("refuseNew")) else ():
-                if not any(matches(name, (pattern,)) for name in names):
+                if not may_match(pattern, names):
                     what = kind.removesuffix("s")
                     hint = "; only --refuse-new can be about what nobody demands yet"
                     message = f"no {what} is called {quoted(pattern)}{suggestion(pattern, names)}"
@@ -344,6 +345,10 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
         config = repo.snapshot().state.config
         if node not in config.nodes:
             message = f"there is no node '{node}'{suggestion(node, config.nodes)}"
+            if node in config.node_patterns:
+                place = config.node_patterns[node].where
+                flag = "true" if drained else "false"
+                message = f"is a pattern of many nodes; write drained: {flag} yourself, in {place}"
             raise InvalidInput.at("NODE", message)
         host, verb = config.host_of(node), "Drain" if drained else "Undrain"
         if config.nodes[host].drained is drained:

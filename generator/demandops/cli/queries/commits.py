@@ -338,11 +338,11 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
     ]
     if (node := given["node"]) is not None:
         # no commit needs to have changed a node that the inventory has
-        nodes = {*repo.snapshot().state.config.nodes}
-        if node not in nodes and not any(
+        config = repo.snapshot().state.config
+        if not config.has_node(node) and not any(
             repo.changes_node(entry.commit, node) for entry in repo.log()
         ):
-            message = f"there is no node {quoted(node)}{suggestion(node, nodes)}"
+            message = f"there is no node {quoted(node)}{suggestion(node, config.nodes)}"
             faults.append(fault("--node", message))
     if faults:
         raise InvalidInput(faults)

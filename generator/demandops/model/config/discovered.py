@@ -112,8 +112,8 @@ def _pattern(reader: ConfigReader, cluster: Cluster) -> EntryPattern[Node]:
     # also for the first node of a role that no application knows, whatever the cluster says of it
     file, place = reader.places[CLUSTERS_FILE][cluster.name]
     data = {"type": "node", **(cluster.discovery or Discovery()).entry}
-    data |= {"id": "{id}", "cluster": cluster.name}
-    return EntryPattern("{id}", "id", Node, data, file, (f"{place}.discovery.entry",))
+    data |= {"id": "{n}", "cluster": cluster.name}
+    return EntryPattern("{n}", "id", Node, data, file, (f"{place}.discovery.entry",))
 
 
 def _of_one_kind(nodes: Mapping[str, Node], listed: Iterable[Node]) -> Iterator[tuple[str, Node]]:

@@ -20,6 +20,15 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from demandops.base.errors import InvalidInput, fault, field_path
+from demandops.base.placeholders import (
+    example_of,
+    filled,
+    glob_of,
+    is_pattern,
+    names,
+    texts,
+    values_in,
+)
 from demandops.base.quoting import quoted
 from demandops.model.config.base_model import faults_of, matches
 from demandops.model.config.inventory import Node
@@ -28,11 +37,6 @@ from demandops.model.config.policy import AccessDomain
 Entry = TypeVar("Entry", bound=BaseModel)
 Value = TypeVar("Value")
 
-# `${n}` and `{{n}}` mean something to others, and are plain text
-_PLACEHOLDER = re.compile(r"(?<![${])\{([a-z][a-z0-9_]*)\}(?!\})")
-# What a placeholder stands for in an id. None of these characters means anything in an expression
-# or a path; what a topic or an address does not allow is a fault of the node.
-_VALUE = "[A-Za-z0-9._-]+"
 _NUMBER = re.compile(r"-?[0-9]+(\.[0-9]+)?")
 # More would take long to match, as each may be of any length
 _MOST_PLACEHOLDERS = 3
@@ -92,12 +96,11 @@ def _overlap(one: str, other: str) -> bool:
 # ---- an entry whose id is a pattern ----
 
 
-def is_pattern(id: object) -> bool:
-    return isinstance(id, str) and _PLACEHOLDER.search(id) is not None
-
-
-def glob_of(id: str) -> str:
-    return _PLACEHOLDER.sub("?*", id)
+def may_match(pattern: str, ids: Iterable[str]) -> bool:
+    """Return whether a pattern with ``*`` and ``?`` may match one of the ids, or of their nodes."""
+    return any(
+        _overlap(pattern, glob_of(id)) if is_pattern(id) else matches(id, (pattern,)) for id in ids
+    )
 
 
 @dataclass(frozen=True)
@@ -120,19 +123,19 @@ class EntryPattern(Generic[Entry]):
         return glob_of(self.id)
 
     def example_ids(self) -> Iterator[str]:
-        return (_PLACEHOLDER.sub(value, self.id) for value in _EXAMPLES)
+        return (example_of(self.id, value) for value in _EXAMPLES)
 
     def values(self, id: str) -> dict[str, str] | None:
-        match = _expression(self.id).fullmatch(id)
-        return {**match.groupdict(), "id": id} if match else None
+        values = values_in(self.id, id)
+        return values and {**values, "id": id}
 
     def entry(self, id: str, own: Mapping[str, Any] = MappingProxyType({})) -> Entry:
         """Return the entry of an id that matches; raise ``InvalidInput`` with its faults.
 
         The fields ``own`` are those of this id alone.
         """
-        filled: Any = _filled(self.data, self.values(id) or {})
-        data: Any = {**filled, **own}
+        data: Any = filled(self.data, self.values(id) or {})
+        data |= own
         try:
             try:
                 return self.model.model_validate(data)
@@ -149,15 +152,23 @@ class EntryPattern(Generic[Entry]):
     @cached_property
     def example(self) -> Entry:
         """The entry of an id that matches, but with the pattern as its id; may be invalid."""
-        in_id = _PLACEHOLDER.findall(self.id)
-        if len(in_id) > _MOST_PLACEHOLDERS:
-            message = f"{quoted(self.id)} has {len(in_id)} placeholders; write at most three"
-            raise InvalidInput([fault(field_path(self.place), message).within(self.file)])
-        names = {"id": None, **dict.fromkeys(in_id)}
-        if unknown := [name for name in _names_in(self.data) if name not in names]:
-            known = ", ".join(f"{{{name}}}" for name in names)
-            message = f"{{{unknown[0]}}} is not in the id {quoted(self.id)}; write one of {known}"
-            raise InvalidInput([fault(field_path(self.place), message).within(self.file)])
+        in_id, where = names(self.id), field_path(self.place)
+        if len(in_id) > _MOST_PLACEHOLDERS or "id" in in_id:
+            message = f"has {len(in_id)} placeholders; write at most three"
+            if "id" in in_id:
+                meant = quoted(self.id.replace("{id}", "{n}"))
+                message = f"{{id}} stands for the whole id; write another name, such as {meant}"
+            raise InvalidInput.at(f"{where}.{self.key}", message, file=self.file)
+        known = {"id": None, **dict.fromkeys(in_id)}
+        listed = ", ".join(f"{{{name}}}" for name in known)
+        faults = [
+            fault(path, f"{{{name}}} is not in the id {quoted(self.id)}; write one of {listed}")
+            for path, text in texts(self.data, where)
+            for name in names(text)
+            if name not in known
+        ]
+        if faults:
+            raise InvalidInput(each.within(self.file) for each in faults)
         errors = []
         for id in self.example_ids():
             try:
@@ -165,40 +176,6 @@ class EntryPattern(Generic[Entry]):
             except InvalidInput as error:
                 errors.append(error)
         raise min(errors, key=lambda error: len(error.faults))  # some only concern a digit
-
-
-@lru_cache(maxsize=65_536)
-def _expression(pattern: str) -> re.Pattern[str]:
-    expression, seen = "", set[str]()
-    for index, part in enumerate(_PLACEHOLDER.split(pattern)):  # texts and names in turn
-        if index % 2 == 0:
-            expression += re.escape(part)
-        else:
-            expression += f"(?P={part})" if part in seen else f"(?P<{part}>{_VALUE})"
-            seen.add(part)
-    return re.compile(expression)
-
-
-def any_value_of(text: str) -> str:
-    """Return a regular expression of RE2 for each text that a text with placeholders may become."""
-    parts = _PLACEHOLDER.split(text)
-    return _VALUE.join(map(re.escape, parts[::2]))
-
-
-def _filled(part: object, values: Mapping[str, str]) -> object:
-    if isinstance(part, str):
-        return _PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), part)
-    if isinstance(part, dict):
-        return {_filled(key, values): _filled(value, values) for key, value in part.items()}
-    return [_filled(each, values) for each in part] if isinstance(part, list) else part
-
-
-def _names_in(part: object) -> Iterator[str]:
-    if isinstance(part, str):
-        yield from _PLACEHOLDER.findall(part)
-    elif isinstance(part, dict | list):
-        for each in (*part, *part.values()) if isinstance(part, dict) else part:
-            yield from _names_in(each)
 
 
 def _read_number(
@@ -212,18 +189,35 @@ def _read_number(
             data[last] = float(data[last]) if "." in data[last] else int(data[last])
 
 
-def only_entry(patterns: Iterable[EntryPattern[Entry]]) -> Callable[[str], Entry | None]:
-    """Return a function that gives the valid entry of the only pattern that matches an id."""
-    globs = Globs((pattern.glob, pattern) for pattern in patterns)
+class EntryPatterns(Generic[Entry]):
+    """The patterns of one kind of entry; ``find`` gives an id's entry, or why it has none."""
 
-    @lru_cache(maxsize=65_536)
-    def entry(id: str) -> Entry | None:
-        matching = [pattern for _, pattern in globs.matching(id) if pattern.values(id)]
-        with suppress(InvalidInput):
-            return matching[0].entry(id) if len(matching) == 1 else None
-        return None
+    def __init__(self, word: str, patterns: Iterable[EntryPattern[Entry]] = ()) -> None:
+        self._word, self._patterns = word, tuple(patterns)
+        self._globs = Globs((pattern.glob, pattern) for pattern in self._patterns)
+        self.find = lru_cache(maxsize=65_536)(self._find)
 
-    return entry
+    def __iter__(self) -> Iterator[EntryPattern[Entry]]:
+        return iter(self._patterns)
+
+    def __len__(self) -> int:
+        return len(self._patterns)
+
+    def candidates(self, id: str) -> Iterator[EntryPattern[Entry]]:
+        return (pattern for _, pattern in self._globs.matching(id))
+
+    def _find(self, id: str) -> tuple[Entry | None, str]:
+        patterns = [pattern for pattern in self.candidates(id) if pattern.values(id)]
+        if len(patterns) > 1:
+            named = " and ".join(f"{quoted(each.id)} in {each.where}" for each in patterns[:2])
+            return None, f"matches {named}; narrow one of these patterns"
+        if not patterns:
+            return None, ""
+        try:
+            return patterns[0].entry(id), ""
+        except InvalidInput as error:
+            pattern = quoted(patterns[0].id)
+            return None, f"is no {self._word} of the pattern {pattern}: {error.faults[0]}"
 
 
 # ---- what the patterns of an inventory give for an id that nobody listed ----
@@ -264,12 +258,11 @@ class UnlistedNodes:
 
     def __init__(
         self,
-        patterns: Iterable[EntryPattern[Node]],
+        patterns: EntryPatterns[Node],
         domains: Mapping[str, AccessDomain],
         complete: Callable[[Node, AccessDomain | None], Node],
     ) -> None:
-        self._patterns = Globs((pattern.glob, pattern) for pattern in patterns)
-        self._domains, self._complete = domains, complete
+        self.patterns, self._domains, self._complete = patterns, domains, complete
         self._globs = Globs((glob, name) for name, d in domains.items() for glob in d.nodes)
         self.find = lru_cache(maxsize=65_536)(self._find)
 
@@ -298,21 +291,10 @@ class UnlistedNodes:
         names = {name for _, name in self._globs.overlapping(glob_of(pattern))}
         return [self._domains[name] for name in sorted(names)]
 
-    def candidates(self, id: str) -> Iterator[tuple[str, EntryPattern[Node]]]:
-        return self._patterns.matching(id)
-
     def _made(self, id: str) -> tuple[Node | None, AccessDomain | None, str]:
-        patterns = [pattern for _, pattern in self._patterns.matching(id) if pattern.values(id)]
-        if len(patterns) > 1:
-            named = " and ".join(f"{quoted(each.id)} in {each.where}" for each in patterns[:2])
-            return None, None, f"matches {named}; narrow one of these patterns"
-        if not patterns:
-            return None, None, ""
-        (pattern,) = patterns
-        try:
-            node = pattern.entry(id)
-        except InvalidInput as error:
-            return None, None, f"is no node of the pattern {quoted(pattern.id)}: {error.faults[0]}"
+        node, problem = self.patterns.find(id)
+        if node is None:
+            return None, None, problem
         by_name = {name: glob for glob, name in self._globs.matching(id)}
         if len(by_name) > 1:
             named = " and ".join(f"'{name}' by {quoted(by_name[name])}" for name in sorted(by_name))
@@ -320,4 +302,5 @@ class UnlistedNodes:
         return node, self._domains[min(by_name)] if by_name else None, ""
 
 
-NOTHING_UNLISTED = UnlistedNodes((), {}, lambda node, _: node)
+NO_BROKER_PATTERNS = EntryPatterns[Any]("broker")
+NOTHING_UNLISTED = UnlistedNodes(EntryPatterns("node"), {}, lambda node, _: node)

@@ -26,7 +26,7 @@ from demandops.model.config.appdef import (
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config, ConfigReader
 from demandops.model.config.cross_check import cross_check
-from demandops.model.config.entry_patterns import Globs, OnDemand, UnlistedNodes, only_entry
+from demandops.model.config.entry_patterns import EntryPatterns, Globs, OnDemand, UnlistedNodes
 from demandops.model.config.inventory import Node, id_in_domain
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.model.config.policy import AccessDomain, AccessDomainsFile
@@ -82,7 +82,8 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         capacity = settings.with_short_names(node.capacity) if node.capacity else node.capacity
         return node.model_copy(update={"capacity": capacity})
 
-    unlisted = UnlistedNodes(reader.patterns[configs.NODES_FILE], domains, completed)
+    node_patterns = EntryPatterns("node", reader.patterns[configs.NODES_FILE])
+    unlisted = UnlistedNodes(node_patterns, domains, completed)
     appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
     clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
@@ -96,12 +97,12 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
             clients = clients.model_copy(update={word: getattr(part, word)})
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
-    for pattern in reader.patterns[configs.NODES_FILE]:
+    for pattern in node_patterns:
         node = pattern.example
         for domain in unlisted.possible_domains(pattern.id):
             _in_further_domains(reader, {node.id: node}, domains, {node.id: domain})
     all_nodes = {id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()}
-    if reader.patterns[configs.NODES_FILE]:
+    if node_patterns:
         all_nodes = OnDemand(all_nodes, lambda id: (made := unlisted.find(id)) and made.node)
         domain_of = OnDemand(domain_of, lambda id: (made := unlisted.find(id)) and made.domain)
         hosts = OnDemand(hosts, unlisted.other_host)
@@ -112,8 +113,9 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     brokers = reader.read_items(
         configs.BROKERS_FILE, inventory.BrokersFile, "brokers", inventory.Broker, "node"
     )
-    if reader.patterns[configs.BROKERS_FILE]:
-        brokers = OnDemand(brokers, only_entry(reader.patterns[configs.BROKERS_FILE]))
+    broker_patterns = EntryPatterns("broker", reader.patterns[configs.BROKERS_FILE])
+    if broker_patterns:
+        brokers = OnDemand(brokers, lambda node: broker_patterns.find(node)[0])
     charts = reader.read_items(configs.CHARTS_FILE, registry.ChartsFile, "charts", registry.Chart)
     images = reader.read_items(configs.IMAGES_FILE, registry.ImagesFile, "images", registry.Image)
     for name, image in images.items():
@@ -147,9 +149,10 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         repo_settings=settings,
         clusters=clusters,
         nodes=all_nodes,
-        node_patterns={each.id: each for each in reader.patterns[configs.NODES_FILE]},
-        broker_patterns=tuple(reader.patterns[configs.BROKERS_FILE]),
+        node_patterns={each.id: each for each in node_patterns},
+        broker_patterns={each.id: each for each in broker_patterns},
         unlisted=unlisted,
+        unlisted_brokers=broker_patterns,
         brokers=brokers,
         domains=domains,
         charts=charts,

@@ -1,0 +1,88 @@
+"""Texts with placeholders, such as ``vehicle{n}``: for entries of the inventory, and rules.
+
+A placeholder is a name in braces. ``${n}`` and ``{{n}}`` mean something to others, and any other
+brace is one. Nothing is evaluated, and values are put in after parsing, so a value cannot change
+the structure of what it is put into.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from typing import Any
+
+_PLACEHOLDER = re.compile(r"(?<![${])\{([A-Za-z_][A-Za-z0-9_]*)\}(?!\})")
+# What a placeholder stands for in an id. None of these characters means anything in an expression
+# or a path; what a topic or an address does not allow is a fault of what is made.
+VALUE = "[A-Za-z0-9._-]+"
+
+
+def names(text: str) -> list[str]:
+    return [*dict.fromkeys(_PLACEHOLDER.findall(text))]
+
+
+def is_pattern(id: object) -> bool:
+    return isinstance(id, str) and _PLACEHOLDER.search(id) is not None
+
+
+def texts(data: Any, path: str = "") -> Iterator[tuple[str, str]]:  # noqa: ANN401 - plain data
+    """Yield each text and each key in ``data``, which is at ``path``, with its own path."""
+    if isinstance(data, str):
+        yield path, data
+    elif isinstance(data, Mapping):
+        for key, value in data.items():
+            yield from texts(key, f"{path}.{key}")
+            yield from texts(value, f"{path}.{key}")
+    elif isinstance(data, list | tuple):
+        for index, item in enumerate(data):
+            yield from texts(item, f"{path}[{index}]")
+
+
+def filled(data: Any, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """Return ``data`` with values for placeholders; one without a value stays.
+
+    A text that is only a placeholder becomes the value itself, for example a number.
+    """
+    if isinstance(data, str):
+        alone = _PLACEHOLDER.fullmatch(data)
+        if alone and alone[1] in values:
+            return values[alone[1]]
+        return _PLACEHOLDER.sub(lambda match: str(values.get(match[1], match[0])), data)
+    if isinstance(data, Mapping):
+        return {
+            str(filled(key, values)) if isinstance(key, str) else key: filled(value, values)
+            for key, value in data.items()
+        }
+    return [filled(item, values) for item in data] if isinstance(data, list | tuple) else data
+
+
+def values_in(text: str, made: str, value: str = VALUE) -> dict[str, str] | None:
+    """Return the values with which ``text`` becomes ``made``; ``None`` if none do."""
+    match = _expression(text, value).fullmatch(made)
+    return match.groupdict() if match else None
+
+
+@lru_cache(maxsize=65_536)
+def _expression(text: str, value: str) -> re.Pattern[str]:
+    expression, seen = "", set[str]()
+    for index, part in enumerate(_PLACEHOLDER.split(text)):  # texts and names in turn
+        if index % 2 == 0:
+            expression += re.escape(part)
+        else:
+            expression += f"(?P={part})" if part in seen else f"(?P<{part}>{value})"
+            seen.add(part)
+    return re.compile(expression)
+
+
+def example_of(id: str, value: str) -> str:
+    return _PLACEHOLDER.sub(value, id)
+
+
+def glob_of(id: str) -> str:
+    return example_of(id, "?*")
+
+
+def any_value_of(text: str) -> str:
+    """Return a regular expression of RE2 for each text that a text with placeholders may become."""
+    return VALUE.join(map(re.escape, _PLACEHOLDER.split(text)[::2]))
