@@ -23,7 +23,7 @@ from .observers import FUSED, Observer
 from .outcome import Outcome, Settings
 from .participants import STATION_CLOUD
 from .rig import reserved
-from .routes import passing
+from .routes import crowd
 from .rules import Event, Near
 
 FILES = ROOT / "examples" / "experiment" / "unlisted"
@@ -52,7 +52,7 @@ class UnlistedExperiment(Experiment):
         # by the pattern, the number in a vehicle's name is its ROS domain
         free = (self._stack.enter_context(reserved()) for _ in range(settings.unlisted))
         self._domains = {f"vehicle{domain}": domain for domain in free}
-        self._routes = passing(settings.seed, tuple(self._domains), settings.gap)
+        self._routes = crowd(settings.seed, settings.gap, tuple(self._domains))
         self._nodes = (*self._domains, *FIXED)
 
     def _files(self, ports: dict[str, int]) -> dict[str, str]:
