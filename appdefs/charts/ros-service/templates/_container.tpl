@@ -7,6 +7,7 @@ A container that runs one command of ROS 2, from a dict:
   run        the command, a list
   tmp        the volume for its /tmp, by default "tmp"
   mounts     further volume mounts, a list; optional
+  setup      scripts to source first, a list; by default .Values.workspaceSetup
 */ -}}
 {{- define "ros-service.container" -}}
 - name: {{ toJson .name }}
@@ -38,7 +39,7 @@ shell never interprets their characters. Without setup scripts, the image's own 
 command line.
 */ -}}
 {{- define "ros-service.start" -}}
-{{- with .root.Values.workspaceSetup -}}
+{{- with hasKey . "setup" | ternary .setup .root.Values.workspaceSetup -}}
 command: ["/bin/bash", "-c", "while [ \"$1\" != -- ]; do . \"$1\" || exit; shift; done; shift; exec \"$@\"", "start"]
 args: {{ concat . (list "--") $.run | toJson }}
 {{- else -}}

@@ -37,6 +37,7 @@ from demandops.cli.target import (
     signing_option,
 )
 from demandops.decide.decision import Decision, decide
+from demandops.decide.state import effects_of
 from demandops.model.config.base_model import duration_text
 from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
@@ -234,6 +235,7 @@ def _row(index: int, request_id: str, outcome: str, **more: Any) -> Json:  # noq
         "warnings": [],
         "not_held": [],
         "placed": [],
+        "effects": [],
     } | more
 
 
@@ -305,7 +307,7 @@ def _book(
         elif not isinstance(result, Receipt):
             rows.append(_row(index, document.request_id, "proposed", proposal=result))
         else:
-            names = ("commit", "warnings", "not_held", "placed")
+            names = ("commit", "warnings", "not_held", "placed", "effects")
             more = {name: getattr(result, name) for name in names}
             rows.append(_row(index, result.request_id, result.outcome, **more))
     done.extend(
@@ -370,6 +372,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
             "warnings": decision.warnings,
             "not_held": decision.changes.not_held,
             "placed": decision.placed,
+            "effects": (*effects_of(decision.releases),),
             "releases": [asdict(release) for release in decision.releases],
             "files": sorted(decision.files),
         }
@@ -405,8 +408,8 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
             if proposal := row.get("proposal"):
                 told = f"awaiting approval {proposal['branch']} {proposal['link']}".rstrip()
             out.print(f"{title} {told}", soft_wrap=True)
-        for choice in row["placed"]:
-            out.print(f"  {choice}", soft_wrap=True)
+        for told in (*row["placed"], *(() if dry_run else row["effects"])):
+            out.print(f"  {told}", soft_wrap=True)
         warnings = [*row["warnings"]]
         lease = document.goal.get("lease") if isinstance(document.goal, dict) else None
         if isinstance(lease, int) and not isinstance(lease, bool):
