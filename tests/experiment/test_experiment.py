@@ -132,7 +132,9 @@ def test_what_comes_back_must_come_while_a_vehicle_is_near_and_only_then() -> No
     run = good()
     come = run.arrivals[EGO]
     for found, holds in ((come, True), ([], False), ([*come, OVER - 1], False)):
-        *_, check = unlisted.checks(replace(run, delivered={VEHICLE: found}))
+        *_, check = unlisted.checks(
+            replace(run, delivered={topic: {VEHICLE: found} for topic in unlisted.BACK})
+        )
         assert check.holds is holds
     assert unlisted.requesters({VEHICLE}).items() > paper.requesters({VEHICLE}).items()
 
