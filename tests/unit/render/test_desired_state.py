@@ -1,4 +1,4 @@
-"""Files below ``clusters/`` are valid and name no requesters."""
+"""Files below ``clusters/`` are valid and name no requesters; each domain has its own folder."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import yaml
 from demandops.repo.merge_check.rendered_charts import manifest_faults
 
 from tests.golden.cases import CASES, rendered
-from tests.kit.goals import application, connection, goal
+from tests.kit.goals import application, connection, goal, perception
 from tests.kit.memory import MemoryRepo
 from tests.kit.plain_yaml import FAST
 
@@ -46,6 +46,23 @@ def test_requesters_appear_nowhere_below_clusters() -> None:
         text = f"{path}\n{yaml.safe_dump(document, allow_unicode=True)}".lower()
         for name in (*names, *demands, "a-request-of", "another one", "requester"):
             assert name.lower() not in text, path
+
+
+def test_each_access_domain_has_its_own_folder_namespace_and_account() -> None:
+    text = "apiVersion: demandops/v1\nkind: AccessDomains\ndomains:\n"
+    for name in ("fleet", "city"):
+        text += f"  - {{name: {name}, namespace: ns-{name}, serviceAccount: sa-{name}, "
+        text += 'rules: [{name: all, peers: ["*"]}], nodes: ['
+        text += '"vehicle*"]}\n' if name == "fleet" else "edge, cloud, station00]}\n"
+    books = MemoryRepo({"policy/access-domains.yaml": text})
+    books.send(perception())
+    for path, document in documents(books):
+        domain = path.split("/")[2]
+        assert document["metadata"]["namespace"] == f"ns-{domain}"
+        account = document.get("spec", {}).get("serviceAccountName", f"sa-{domain}")
+        assert account == f"sa-{domain}"
+    folders = {path.split("/")[2] for path, _ in documents(books)}
+    assert folders == {"fleet", "city"}
 
 
 CONFIG = "apiVersion: v1\nkind: ConfigMap\nmetadata: {name: a, namespace: b}\n"
