@@ -28,7 +28,8 @@ NODES = "inventory/nodes.yaml"
 
 _TEXTS = plain_yaml.beside(__file__)
 TRAPS, UNSEEN, LABELS = (_TEXTS[name] for name in ("traps", "unseen", "labels"))
-IDS = [text for text in (*TRAPS, "x", "x-watcher") if one_form(text) == text]
+# a node's id has no star
+IDS = [t for t in (*TRAPS, "x", "x-watcher") if one_form(t) == t and "*" not in t]
 
 
 class Core(FAST):  # type: ignore[misc]
