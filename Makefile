@@ -17,7 +17,7 @@ SIMULATION_TESTS := tests/simulation
 KILL_TESTS := tests/ros/test_crash.py
 # What takes long because it has remotes, crashes, ROS, brokers, servers or much work.
 PROCESS_TESTS := tests/ros tests/conformance tests/experiment tests/unit/decide/test_budget.py \
-  tests/unit/model/test_thousands_of_entries.py $(addprefix tests/integration/,repo mqtt web \
+  $(addprefix tests/integration/,repo mqtt web \
     test_command_line.py test_get.py test_hostile_checkouts.py test_inbound_webhook.py \
     test_person_commands.py test_proposals.py)
 # One worker more than cores, because one is busy with the tests of ROS, which mostly wait.

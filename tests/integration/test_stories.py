@@ -42,6 +42,10 @@ class Step(FrozenModel):
     """What a person edits in the clone ``$clone``, which the first use makes."""
     git: list[str] = Field(default_factory=list)
     """Commands of git in the clone."""
+    links: dict[str, str] = Field(default_factory=dict)
+    """Links in the clone, by path; each replaces what is there."""
+    notes: dict[str, str] = Field(default_factory=dict)
+    """More names for the later steps, such as `seen: $head`."""
     run: str = ""
     """The command. Those that take a state repo get ``--state-repo $repo``, unless `inside` says in
     which folder of the clone, or `environment` with which variables, the command runs.
@@ -119,6 +123,7 @@ class Teller:
         words["head"] = git(repo, "rev-parse", words["branch"])
         words |= {"tip": self.repo.tip, "clone": str(self.clone), "folder": str(self._folder)}
         step = Step.model_validate(_filled(told, words | self._names))
+        self._names = self._names | step.notes
         send(repo, step.sends)
         if step.commits:
             texts = self.repo.files()
@@ -134,6 +139,10 @@ class Teller:
             _ = file.unlink() if new is None else file.write_text(new)
         for command in step.git:
             git(self.clone, *shlex.split(command))
+        for path, target in step.links.items():
+            link = self.clone / path
+            _ = shutil.rmtree(link) if link.is_dir() else link.unlink(missing_ok=True)
+            link.symlink_to(target)
         with patch.context() as own:
             if step.inside:
                 own.chdir(self.clone / step.inside)

@@ -477,7 +477,7 @@ def drop(root: Path, operation: str) -> Path | None:
                 branch = ticket.proposal.branch
                 raise StateRepoError(
                     f"demand {operation} awaits approval on {branch}; turn it down with "
-                    f"`demandops reject {branch}`"
+                    f"`demandops reject {branch} -m REASON`"
                 )
             journal = Journal(file)
             journal.mark_done([operation], durably=True)

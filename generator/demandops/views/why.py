@@ -101,7 +101,9 @@ def find(source: Source, name: str, kind: str | None = None) -> Thing:
     # a part of a release's name, or the start of a demand's id; what runs before what has ended
     running = sorted(release for release in source.releases if name in release)
     demands = sorted(id for id in _demands(source) if id.startswith(name))
-    stopped = commit_log.stopped_releases(reader.objects, source.commit).values()
+    stopped = commit_log.removed_files(
+        reader.objects, source.commit, commit_log.RELEASE_FILES
+    ).values()
     ended = sorted({release for names in stopped for release in names})
     were = [release for release in ended if name in release]
     past = {id for entry in reader.log(source.commit) for id in entry.trailers.get("Demand-Id", ())}

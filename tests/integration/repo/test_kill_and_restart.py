@@ -169,7 +169,7 @@ def test_two_processes_have_slots_of_their_own_and_a_dead_ones_journal_is_adopte
 ) -> None:
     with rig.running(url) as first:
         # a second process is killed beside the first, with a demand in its journal
-        told = drivers.start(url, [[demand("join-1", goal(1))]], dies=True).listen()
+        told = rig.listen(drivers.start(url, [[demand("join-1", goal(1))]], dies=True))
         assert told.finished is None
         slots = sorted(path.name for path in next(data_home.iterdir()).iterdir())
         assert slots == ["slot-0", "slot-1"]
@@ -191,7 +191,7 @@ def test_the_journal_of_one_state_repo_is_never_played_into_another(
     for folder in (here, there):
         folder.mkdir()
         new_repo(f"{folder.name}/state.git")
-    drivers.start("state.git", [[demand("join-1", goal(1))]], cwd=here, dies=True).listen()
+    rig.listen(drivers.start("state.git", [[demand("join-1", goal(1))]], cwd=here, dies=True))
     assert rig.restart(there / "state.git") is True
     assert rig.operations(there / "state.git") == []
     # the journal is found again however the folder is named

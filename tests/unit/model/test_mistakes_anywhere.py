@@ -35,7 +35,7 @@ FREE = {
     *(f"{kind}ClientSettings.{probe}" for kind in ("", "Mqtt") for probe in PROBES),
 }
 FREE_PLACES = (
-    *("values", "parameters.rate.default"),
+    *("values", "parameters.rate.default", "parameters.size.oneOf"),
     *(f"{kind}.{probe}" for kind in ("mqtt", "zenoh", "ros") for probe in PROBES),
 )
 

@@ -205,7 +205,7 @@ def _create(
     options: Options,
 ) -> None:
     with writable(options) as repo:
-        options.require_reason()
+        options = options.with_reason()
         if not (chosen := selector(selected)):
             raise click.UsageError("select what the override applies to, for example --node edge")
         if repo.file_reader()(_path_of(name)) is not None:

@@ -148,9 +148,12 @@ class EntryPattern(Generic[Entry]):
     def example(self) -> Entry:
         """The entry of an id that matches, but with the pattern as its id; may be invalid."""
         in_id, where = names(self.id), field_path(self.place)
-        if len(in_id) > _MOST_PLACEHOLDERS:
-            message = f"{quoted(self.id)} has {len(in_id)} placeholders; write at most three"
-            raise InvalidInput([fault(where, message).within(self.file)])
+        if len(in_id) > _MOST_PLACEHOLDERS or "id" in in_id:
+            message = f"has {len(in_id)} placeholders; write at most three"
+            if "id" in in_id:
+                meant = quoted(self.id.replace("{id}", "{n}"))
+                message = f"{{id}} stands for the whole id; write another name, such as {meant}"
+            raise InvalidInput.at(f"{where}.{self.key}", message, file=self.file)
         known = {"id": None, **dict.fromkeys(in_id)}
         listed = ", ".join(f"{{{name}}}" for name in known)
         faults = [

@@ -254,7 +254,14 @@ ResourceName = Annotated[
 # How much of each resource a node has, or a service requests
 Resources = dict[ResourceName, Quantity]
 
-NodeId = Annotated[str, base_model.OneForm, base_model.without(id_problem)]
+
+def _node_id_problem(id: str) -> str:
+    if "*" in id:
+        return f"{quoted(id)} is no id; for a pattern, write {quoted(id.replace('*', '{n}', 1))}"
+    return id_problem(id)
+
+
+NodeId = Annotated[str, base_model.OneForm, base_model.without(_node_id_problem)]
 Topic = Annotated[str, base_model.without(topic_problem)]
 MessageType = Annotated[str, base_model.without(message_type_problem)]
 
