@@ -157,6 +157,7 @@ def check(
                 *warnings.ignored_field_warnings(state.config),
                 *warnings.truth_warnings(files),
                 *warnings.request_warnings(state.config),
+                *warnings.live_warnings(state),
                 *warnings.policy_warnings(state),
                 *warnings.unmatched_pattern_warnings(state.config),
                 *warnings.tied_override_warnings(new.values()),
