@@ -284,7 +284,10 @@ def log(
     """
     with reader.opened(state_repo) as repo:
         for side in filter(None, (commit_range or "").split("..")):
-            resolved(repo, side)
+            try:
+                resolved(repo, side)
+            except BeforeTheFirst as error:
+                errors.print(str(error))
         release, path = given.pop("release"), None
         if release is not None:
             tip = repo.commit((commit_range or "").rpartition("..")[2])
