@@ -24,7 +24,7 @@ from demandops.decide.placement.relocation import following_overrides, with_move
 from demandops.decide.planning.flows import flows_without_carrier, topics_of_origin
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import claims_needing
-from demandops.decide.state import State
+from demandops.decide.state import State, trial_releases
 from demandops.model.config.appdef import ignored_fields
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, NODES_FILE, Config
@@ -35,6 +35,7 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import Changes, World
 from demandops.model.release import Release
+from demandops.render.gitops import values_of
 from demandops.templating.charts import defaults, overridden
 from demandops.templating.values import takes_requests
 
@@ -311,6 +312,38 @@ def request_warnings(config: Config) -> Iterator[Fault]:
                     "`requests` where the chart reads them"
                 )
                 yield fault("", message).within(template)
+
+
+# ---- values that a running service is said to take over ----
+
+
+def live_warnings(state: State) -> Iterator[Fault]:
+    """Warn of ``live`` values that do not exist, or for which the chart starts the pods anew."""
+    config = state.config
+    found = dict[Fault, None]()  # one instance of a service has what another has
+    for release in (each for releases in trial_releases(config).values() for each in releases):
+        service, chart, known = release.service, release.chart, dict[str, object]()
+        with suppress(InvalidInput):  # which is told as a fault, or is YAML that only Helm reads
+            known |= defaults(chart.folder, config.files) if chart.folder else {}
+            known |= values_of(release, config, state.evaluate)
+        place = "live" if service.shared else f"services.{service.name}.live"
+        for name in service.live:
+            # a template may write a value only sometimes
+            written = re.search(rf"(?m)^{re.escape(name)}:", config.files.get(service.values, ""))
+            if name not in known and not written:
+                problem = (
+                    f"'{name}' is no value that {service.values} writes or the chart "
+                    f"'{service.chart}' has{suggestion(name, known)}; correct it, or remove it"
+                )
+            elif name == "parameters" and known.get("reconfigure") == "restart":
+                problem = (
+                    f"'{name}' restarts the pods, as `reconfigure: restart` of the chart "
+                    f"'{service.chart}' says; remove it here, or write `reconfigure: live` there"
+                )
+            else:
+                continue
+            found[fault(place, problem).within(service.file)] = None
+    yield from found
 
 
 _TRUTH = re.compile(  # a brace inside a text is that of a placeholder: vehicle{n}

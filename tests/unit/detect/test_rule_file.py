@@ -21,7 +21,7 @@ from tests.kit.detection import SOURCES, demand, rule, text_of
 
 ROOT = Path(__file__).parents[3]
 NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
-MISTAKES = plain_yaml.load(Path(__file__).with_name("mistakes.yaml").read_text())
+MISTAKES = plain_yaml.beside(__file__, "mistakes")
 
 
 def faults(text: str) -> tuple[Fault, ...]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -23,7 +22,7 @@ CHART = "appdefs/object-detection-fusion/charts/object-detection"
 SCHEMA = f"{CHART}/values.schema.json"
 LAST = skeleton()[TEMPLATE].count("\n") + 1
 """The number of the line that is appended to the template."""
-LISTED = plain_yaml.load(Path(__file__).with_name("template-mistakes.yaml").read_text())
+LISTED = plain_yaml.beside(__file__, "template-mistakes")
 
 
 def refused(changed: dict[str, str]) -> list[str]:

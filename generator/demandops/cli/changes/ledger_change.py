@@ -312,7 +312,7 @@ def rollback(
     if demand and application:
         raise click.UsageError("give --demand or --application, not both")
     if not options.dry_run:
-        options.require_reason()
+        options = options.with_reason()
     to, since = "", list[str]()
 
     def goal_of(repo: Reader, state: State) -> Goal:
