@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from demandops.decide.state import ReleaseChange, describe_change, planned_releases
+from demandops.decide.state import describe_change, planned_releases
 
 from tests.kit.config import override
 from tests.kit.goals import put
@@ -28,17 +28,11 @@ def test_an_override_has_the_effect_of_what_it_changes(
     changed: dict[str, Any], effect: str
 ) -> None:
     text = override({"services": ["object-fusion"]}, **changed)
-    before, after = MemoryRepo(), MemoryRepo({"overrides/test.yaml": text})
-    for repo in (before, after):
+    sides = list[tuple[Any, str]]()
+    for repo in (MemoryRepo(), MemoryRepo({"overrides/test.yaml": text})):
         repo.send(put("fusion"))
-    assert change_between(before, after).effect == effect
-
-
-def change_between(before: MemoryRepo, after: MemoryRepo) -> ReleaseChange:
-    def of(repo: MemoryRepo) -> tuple[Any, str]:
-        (path,) = (path for path in repo.files if path.endswith(f"/{FUSION}.yaml"))
         by_name = {release.name: release for release in planned_releases(repo.state).values()}
-        return by_name[FUSION], repo.files[path]
-
-    (was, current), (now, text) = of(before), of(after)
-    return describe_change(was, now, current, text)
+        (path,) = (path for path in repo.files if path.endswith(f"/{FUSION}.yaml"))
+        sides.append((by_name[FUSION], repo.files[path]))
+    (was, current), (now, written) = sides
+    assert describe_change(was, now, current, written).effect == effect

@@ -44,6 +44,12 @@ def messages() -> Iterator[tuple[str, str]]:
     desk = Desk(now=NOW)
     desk.join("vehicle00")
     yield "a shutdown that lists what was not held", text(desk.send(goal))
+    some = goals.application("edge/fusion", clouds=[("/stations/station00/rear", "station00")])
+    desk = Desk(now=NOW)
+    desk.join("vehicle00")
+    desk.join("vehicle00", cloud="/stations/station00/rear")
+    goal = goals.goal([some], [], id="intersection", shutdown=True)
+    yield "a shutdown of a topic", text(desk.send(goal))
     releases = [ReleaseChange("of-edge", "object-fusion on edge", "", "change", ("- replicas 1",))]
     problems = [fault("nodes[0].id", "appears twice; remove one").within("inventory/nodes.yaml")]
     ids, how = ("c" * 40, "b" * 40), "correct the files, or undo the commits: git revert cccc"

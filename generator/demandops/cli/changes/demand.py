@@ -89,7 +89,7 @@ class Document:
     "ends once they are proposed, and the next generator that starts on this machine for this "
     "state repo continues with them.",
 )
-@click.option("--action", metavar="NAME", help="Over ROS: the name of the node's action Demand.")
+@click.option("--action", metavar="NAME", help="Over ROS: the name of the node's action.")
 @click.option(
     "--timeout",
     type=click.FloatRange(min=0, min_open=True),
@@ -118,7 +118,7 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     FILE contains documents of the kind Demand (docs/demand.md), or goals of the action
     DeploymentRequest as YAML, as for `ros2 action send_goal`. Write - for standard input. With a
     state repo at hand, the command books directly in it; otherwise, and with --via ros, it sends
-    the documents of the kind Demand over ROS 2 to a running node. If it cannot parse one of the
+    the goals over ROS 2 to a running node. If it cannot parse one of the
     documents, it takes none. Otherwise it takes the documents in order, also if one is refused.
 
     \b
@@ -191,10 +191,11 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
 def _send(
     documents: list[Document], hold: bool, action: str | None, timeout: float | None, output: str
 ) -> list[Json]:
-    for document in documents:
-        if not is_demand_goal(document.goal):
-            message = "is not Demand; book a DeploymentRequest with --via git, without a node"
-            raise InvalidInput([fault("kind", message).within(document.file)])
+    kinds = {is_demand_goal(document.goal) for document in documents}
+    if hold and False in kinds:
+        raise click.UsageError("--hold is for documents of the kind Demand")
+    if action and len(kinds) > 1:
+        raise click.UsageError("--action names one action; send the goals of the other apart")
     # only here, because booking works without ROS
     from demandops.cli.main import imported  # noqa: PLC0415
 
