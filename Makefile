@@ -129,6 +129,7 @@ e2e-argocd: system-e2e-argocd setup go  ## Run the end-to-end tests with Argo CD
 # With FIGURES=1 the target also draws the plots of the docs: docs/figures
 experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
 experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (examples/experiment/full/README.md)
+	@$(if $(findstring unlisted,$(EXPERIMENT)),$(PY) ros_bridge/interfaces/build.py examples/experiment/unlisted/messages)
 	@$(PY) -m examples.experiment.full $(EXPERIMENT)
 
 check: system-test setup  ## Format, lint, types, imports, docs, test, test-processes and test-packages

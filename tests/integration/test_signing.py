@@ -225,7 +225,11 @@ class TestVerify:
         book("b")
         ran = on("verify", "main~2..main")
         assert ran.code == 0
-        assert ran.out.splitlines()[-2:] == ["2 of 2 commits are verified", "1 of 2 are signed"]
+        told = ran.out.splitlines()[-3:]
+        assert told[:2] == ["2 of 2 commits are verified", "1 of 2 are signed"]
+        assert told[2].startswith(
+            "not proven: who made 2 of them, whose signatures are not checked"
+        )
         state.commit({SIGNERS: listed(key)}, "Only signed commits\n")
         book("good", key)
         assert rows(0)[-1]["signer"] == "generator@example.org"

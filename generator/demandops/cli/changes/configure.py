@@ -18,19 +18,22 @@ from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestio
 from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.base.settings import GENERATED_ROOTS
+from demandops.base.settings import GENERATED_ROOTS, MAIN_BRANCH
 from demandops.base.strict_yaml import faults_in, read_input
 from demandops.cli import target
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import Options, changing, propose_option, writable
 from demandops.cli.output import read_by
+from demandops.cli.queries.commits import in_effect
 from demandops.cli.target import all_names, names_of
 from demandops.decide.booking import Drain
 from demandops.decide.placement import relocation
 from demandops.decide.state import State
 from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
 from demandops.model.config.config import NODES_FILE
+from demandops.model.config.discovered import is_discovered
 from demandops.model.config.entry_patterns import may_match
+from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.ledger.claim import LEDGER_ROOT
@@ -358,6 +361,12 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             )
             raise StateRepoError(message)
         path = config.file_of(NODES_FILE, host)
+        if is_discovered(path):
+            verb = "cordon" if drained else "uncordon"
+            way = shlex.join(["kubectl", verb, "-l", f"{NODE_LABEL}={host}"])
+            cluster = config.nodes[host].cluster
+            message = f"'{host}' is as cluster '{cluster}' has it; there, run: {way}"
+            raise StateRepoError(message)
         text = repo.file_reader()(path) or ""
         try:
             changed = strict_yaml.set_flag(text, "nodes", host, "drained", drained)
@@ -434,20 +443,24 @@ def revert(commit: str, options: Options) -> None:
     with writable(options) as repo:
         id = repo.commit(commit)
         entry = next(repo.log(id))
-        demands = entry.trailers.get("Demand-Id", ())
         paths = repo.files_changed_by(id)
         booked = [
             path for path in paths if path.split("/", 1)[0] in (LEDGER_ROOT, *GENERATED_ROOTS)
         ]
         if entry.by_generator or booked:
             who = "a generator made it" if entry.by_generator else f"it changes {booked[0]}"
-            ways = [f"demandops release {shlex.quote(demand)}" for demand in demands]
-            if follows := entry.first("Follows"):  # it carries out what a person committed
-                ways.append(f"demandops revert {follows[:10]}")
-            ways.append(f"demandops rollback {id[:10]}~1 -m REASON")
+            snapshot, demands = repo.snapshot(), entry.trailers.get("Demand-Id", ())
+            held = snapshot.state.ledger.indexed_names("demand")
+            ways = [f"demandops release {shlex.quote(name)}" for name in demands if name in held]
+            # what carries out a person's commit, or says that it is not valid, booked nothing
+            follows = entry.first("Follows")
+            back = f"revert {follows[:10]}" if follows else f"rollback {id[:10]}~1 -m REASON"
+            ways.append(f"demandops {back}")
             message = (
                 f"{id[:10]} is not undone by a revert, because {who}; run: {' or '.join(ways)}"
             )
+            if snapshot.faults:
+                message += f"; {MAIN_BRANCH} is not valid: {in_effect(repo, snapshot)}"
             raise StateRepoError(message)
         before, after, now = (repo.file_reader(each) for each in (f"{id}~1", id, None))
         if changed := [path for path in paths if now(path) != after(path)]:
