@@ -36,7 +36,7 @@ COMMANDS = {
     "demand": "Demand what files ask for: book it, or send it to a node.",
     "detect": "Watch topics, and send the demands that rules ask for.",
     "diff": "Show the differences between two commits.",
-    "drain": "Take a node out of use: nothing new is placed there.",
+    "drain": "Take a node out of use: the generator places nothing there.",
     "get": "List demands, releases, nodes, overrides and so on.",
     "init": "Create a state repo.",
     "journal": "List the accepted demands that are not published.",

@@ -388,13 +388,14 @@ def drain(node: str, options: Options) -> None:
     """Take a node out of use: nothing new is placed there.
 
     The command sets `drained: true` in the inventory. The generator then moves away what it placed
-    on the node. What a demand itself put on the node stays; `demandops release` or `demandops
-    decommission` ends that.
+    on the node, and places nothing there. What a demand names the node for stays, and such demands
+    are still accepted; an override with `--on` moves it, and `demandops release` ends it.
 
     \b
     Examples:
       demandops drain edge --dry-run
       demandops drain edge -m "Maintenance"
+      demandops override create off-edge --node edge --on cloud -m "Maintenance"
     """
     _set_drained(node, True, options)
 
