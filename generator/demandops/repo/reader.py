@@ -242,9 +242,10 @@ class Reader:
     def edits(self, entry: LogEntry, kind: str, name: str) -> bool:
         """Return whether a commit changes an override that selects a thing, or a node's entry.
 
-        It is by a person, or by a generator that ends an override.
+        It is by a person, or by a generator that ends an override or takes over nodes.
         """
-        if entry.by_generator and entry.first("Operation") != "expire-override":
+        operation = entry.first("Operation")
+        if entry.by_generator and operation not in ("expire-override", "discover"):
             return False
         commit = trees.commit_of(self.objects, entry.commit)
         sides = trees.parent_tree(commit), commit.tree

@@ -31,7 +31,9 @@ from demandops.decide.placement import relocation
 from demandops.decide.state import State
 from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
 from demandops.model.config.config import NODES_FILE
+from demandops.model.config.discovered import is_discovered
 from demandops.model.config.entry_patterns import may_match
+from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.ledger.claim import LEDGER_ROOT
@@ -376,6 +378,12 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             )
             raise StateRepoError(message)
         path = config.file_of(NODES_FILE, host)
+        if is_discovered(path):
+            verb = "cordon" if drained else "uncordon"
+            way = shlex.join(["kubectl", verb, "-l", f"{NODE_LABEL}={host}"])
+            cluster = config.nodes[host].cluster
+            message = f"'{host}' is as cluster '{cluster}' has it; there, run: {way}"
+            raise StateRepoError(message)
         text = repo.file_reader()(path) or ""
         try:
             changed = strict_yaml.set_flag(text, "nodes", host, "drained", drained)

@@ -202,7 +202,7 @@ def entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
     *("join", "shutdown", "put", "release", "renew", "expire", "wait", "decommission", "drain"),
-    *("follow", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
+    *("follow", "discover", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
 )
 
 _TRAILERS = {
