@@ -21,7 +21,8 @@ from demandops.base.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_N
 from demandops.base.strict_yaml import read_input
 from demandops.detect.condition import entity_in
 from demandops.detect.detector import Detector, Outcome, Sending, Want, WantedDemands, booked_events
-from demandops.detect.event_engine import Key, MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Key, Observation
+from demandops.detect.message_reader import MessageReader, Unreadable
 from demandops.detect.rule_file import Goal, RuleFile, read
 from demandops_interfaces.msg import Bookkeeping
 from rclpy.clock import Clock, ClockType

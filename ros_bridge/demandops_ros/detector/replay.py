@@ -17,7 +17,8 @@ from demandops.cli.formats import Table
 from demandops.cli.output import errors
 from demandops.detect.condition import Count, Near, entity_in
 from demandops.detect.detector import Detector
-from demandops.detect.event_engine import Event, Key, MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Event, Key, Observation
+from demandops.detect.message_reader import MessageReader, Unreadable
 from demandops.detect.rule_file import Goal, RuleFile
 from demandops.views.rows import Column
 from rosbags.highlevel import AnyReader
