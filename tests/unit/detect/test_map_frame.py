@@ -84,6 +84,9 @@ def test_a_place_that_the_map_has_not_is_left_out(place: tuple[float, float]) ->
 @pytest.mark.parametrize(
     ("map", "says"),
     [
+        ({}, "needs either latitude and longitude, or crs with x and y, or frame"),
+        ({"frame": "/map"}, "a frame of /tf, such as map or vehicle01/odom"),
+        ({"frame": "map"}, "reports degrees; add to the file where its metres are on earth"),
         ({"latitude": 1.0}, "needs either latitude and longitude, or crs with x and y"),
         (AACHEN | {"crs": "EPSG:25832"}, "needs either latitude and longitude, or crs"),
         (AACHEN | {"x": 1.0}, "has x or y, which belong to crs"),
