@@ -29,7 +29,10 @@ def heard_live(
 ) -> str:
     """Return the log of a detector until it told ``events`` events; record beside ``rules``."""
     log, bag = rules.with_suffix(".log"), rules.with_name("bag")
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+    # the wheels of another environment look for their own libraries
+    foreign = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH")
+    environment = {name: text for name, text in os.environ.items() if name not in foreign}
+    environment["ROS_DOMAIN_ID"] = str(domain)
     detect = [python, "-m", "demandops.cli.main", "detect", str(rules), "--ros-args"]
     with log.open("w") as sink:
         detecting = subprocess.Popen(

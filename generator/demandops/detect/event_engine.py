@@ -25,6 +25,7 @@ Key: TypeAlias = tuple[str, tuple[str, ...]]
 Cell: TypeAlias = tuple[str, str, int, int]
 
 _NOTHING: Mapping[Any, Any] = MappingProxyType({})
+_NOBODY: frozenset[str] = frozenset()
 
 
 class Observation(NamedTuple):
@@ -88,7 +89,7 @@ class State:
     counted: dict[Who, frozenset[str]] = field(default_factory=dict)
     # How many entities a rule counts, by the name of the rule.
     counts: dict[str, int] = field(default_factory=dict)
-    # The entities in each square, for rules on pairs.
+    # The entities in and around each square, for rules on pairs.
     cells: dict[Cell, frozenset[str]] = field(default_factory=dict)
 
     def copied(self) -> State:
@@ -130,7 +131,8 @@ def distance(last: Observation, other: Observation) -> float:
 
 class Pairs:
     # The map is divided into squares as wide as the distance at which the condition stops. So all
-    # partners of an entity are in the entity's square and the squares around it.
+    # partners of an entity are in the entity's square and the squares around it. An entity is noted
+    # in all nine, because it seldom changes its square: one look then finds its partners.
 
     def __init__(self, rule: Rule, condition: Together) -> None:
         self.rule, self.condition = rule, condition
@@ -161,25 +163,33 @@ class Pairs:
         left, entered = self._cell(before), self._cell(after)
         if left == entered:
             return
-        if left is not None:
-            cells[left] = cells[left] - {entity}
-            if not cells[left]:
-                del cells[left]
-        if entered is not None:
-            cells[entered] = cells.get(entered, frozenset()) | {entity}
+        around_left, around_entered = {*_nine(left)}, {*_nine(entered)}
+        for cell in around_left - around_entered:
+            cells[cell] -= {entity}
+            if not cells[cell]:
+                del cells[cell]
+        for cell in around_entered - around_left:
+            cells[cell] = cells.get(cell, frozenset()) | {entity}
 
-    def around(self, cells: Mapping[Cell, frozenset[str]], seen: Observation) -> Iterator[Who]:
-        """Yield all entities that are near enough, and some that are too far away."""
-        cell = self._cell(seen)
-        if cell is None:
-            return
+    def around(self, cells: Mapping[Cell, frozenset[str]], seen: Observation) -> list[Who]:
+        """Return all entities that are near enough, and some that are too far away, in order."""
+        if (cell := self._cell(seen)) is None:
+            return []
         source = self._second if seen.source == self._first else self._first
-        name, _, at_x, at_y = cell
+        if source != seen.source:
+            cell = (cell[0], source, cell[2], cell[3])
+        near = cells.get(cell)
+        if not near or (len(near) == 1 and source == seen.source):  # alone
+            return []
+        return [(source, name) for name in sorted(near) if (source, name) != seen.who]
+
+
+def _nine(cell: Cell | None) -> Iterator[Cell]:
+    if cell is not None:
+        name, source, at_x, at_y = cell
         for x in (at_x - 1, at_x, at_x + 1):
             for y in (at_y - 1, at_y, at_y + 1):
-                for entity in cells.get((name, source, x, y), ()):
-                    if (source, entity) != seen.who:
-                        yield source, entity
+                yield name, source, x, y
 
 
 # ---- an index of areas by position ----
@@ -362,22 +372,25 @@ class EventEngine:
     # ---- observations ----
 
     def _observe(self, observation: Observation) -> None:  # noqa: PLR0912
-        if observation.at != self._state.now:
-            observation = observation._replace(at=self._state.now)
-        who, source, entity = observation.who, observation.source, observation.entity
-        before = self._state.seen.get(who)
-        self._state.seen[who] = observation
-        self._state.awaited.pop(who, None)
-        self._state.due = min(self._state.due, observation.at + self.timeouts[source])
+        state = self._state
+        if observation.at != state.now:
+            observation = observation._replace(at=state.now)
+        source, entity, at, position, values = observation
+        who = (source, entity)
+        before = state.seen.get(who)
+        state.seen[who] = observation
+        if state.awaited:
+            state.awaited.pop(who, None)
+        state.due = min(state.due, at + self.timeouts[source])
         for rule, limits in self.thresholds[source]:
-            value = observation.values.get(limits.field)
+            value = values.get(limits.field)
             if value is not None and rule.takes(who):
                 is_past, is_back = limits.is_past(value), limits.is_back(value)
                 self._latch((rule.name, (entity,)), rule, is_past, is_back)
-        if observation.position is None:
+        if position is None:
             return
-        x, y = observation.position
-        compared, counted = set[str](), set[str]()
+        x, y = position
+        compared, counted = set[str](), frozenset[str]()
         for rule, area in self.areas[source].at(x, y):
             if not rule.takes(who):
                 continue
@@ -386,34 +399,34 @@ class EventEngine:
                 compared.add(rule.name)
                 self._latch((rule.name, (entity,)), rule, away <= area.start, away > area.stop)
             elif away <= area.radius:
-                counted.add(rule.name)
+                counted |= {rule.name}
         # The index does not yield the areas that the entity has left, so their events end here.
-        for key in sorted(self._state.engaged.get(who, ())):
-            left = self.rules[key[0]]
-            if isinstance(left.condition, Near) and key[0] not in compared:
-                self._latch(key, left, False, True)
-        counted_before = self._state.counted.get(who, frozenset())
-        if counted != counted_before:
-            self._state.counted[who] = frozenset(counted)
+        if engaged := state.engaged.get(who):
+            for key in sorted(engaged):
+                left = self.rules[key[0]]
+                if isinstance(left.condition, Near) and key[0] not in compared:
+                    self._latch(key, left, False, True)
+        if counted != (counted_before := state.counted.get(who, _NOBODY)):
+            state.counted[who] = counted
             for name in sorted(counted ^ counted_before):
                 self._count(name, 1 if name in counted else -1)
         for pairs in self.pairs[source]:
             if pairs.rule.takes(who):
-                pairs.move(self._state.cells, entity, before, observation)
+                pairs.move(state.cells, entity, before, observation)
                 self._compare_with_others(pairs, observation)
 
     def _compare_with_others(self, pairs: Pairs, observation: Observation) -> None:
         who, compared = observation.who, set[Key]()
-        rule, limits = pairs.rule, pairs.condition
-        for other in sorted(pairs.around(self._state.cells, observation)):
-            key, away = pairs.key(who, other), distance(observation, self._state.seen[other])
+        rule, limits, state = pairs.rule, pairs.condition, self._state
+        for other in pairs.around(state.cells, observation):
+            key, away = pairs.key(who, other), distance(observation, state.seen[other])
             compared.add(key)
             self._latch(key, rule, away <= limits.start, away > limits.stop)
         # The squares around do not have the partners that are far away, so their events end here. A
         # partner that is still awaited after a restart has no position yet.
-        for key in sorted(self._state.engaged.get(who, ())):
+        for key in sorted(state.engaged.get(who, ())):
             is_left = key[0] == rule.name and key not in compared
-            if is_left and all(entity in self._state.seen for entity in rule.entities_of(key[1])):
+            if is_left and all(entity in state.seen for entity in rule.entities_of(key[1])):
                 self._latch(key, rule, False, True)
 
     def _count(self, name: str, change: int) -> None:

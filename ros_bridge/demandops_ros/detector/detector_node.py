@@ -479,7 +479,8 @@ class DetectorNode(Node):  # type: ignore[misc]
 def _read_rules(path: Path) -> tuple[RuleFile, str]:
     place, text = read_input(path)
     file = read(text, place)
-    remedy = "install its package, or start the detector in a workspace that has it"
+    remedy = "build it from the folder of its definitions (docs/detector.md#messages), or start "
+    remedy += "the detector in a workspace that has it"
     faults = [
         fault(f"sources.{name}.type", f"{source.type} is not installed; {remedy}")
         for name, source in file.sources.items()
