@@ -14,10 +14,10 @@ PACKAGE_TESTS := tests/packages
 PAGE_TESTS := tests/page
 DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
-KILL_TESTS := tests/integration/repo/test_kill_and_restart.py tests/ros/test_crash.py
+KILL_TESTS := tests/ros/test_crash.py
 # What takes long because it has remotes, crashes, ROS, brokers, servers or much work.
 PROCESS_TESTS := tests/ros tests/conformance tests/experiment tests/unit/decide/test_budget.py \
-  tests/unit/model/test_thousands_of_entries.py $(addprefix tests/integration/,repo mqtt web \
+  $(addprefix tests/integration/,repo mqtt web \
     test_command_line.py test_get.py test_hostile_checkouts.py test_inbound_webhook.py \
     test_person_commands.py test_proposals.py)
 # One worker more than cores, because one is busy with the tests of ROS, which mostly wait.
@@ -130,6 +130,7 @@ e2e-argocd: system-e2e-argocd setup go  ## Run the end-to-end tests with Argo CD
 # With FIGURES=1 the target also draws the plots of the docs: docs/figures
 experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
 experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (examples/experiment/full/README.md)
+	@$(if $(findstring unlisted,$(EXPERIMENT)),$(PY) ros_bridge/interfaces/build.py examples/experiment/unlisted/messages)
 	@$(PY) -m examples.experiment.full $(EXPERIMENT)
 
 check: system-test setup  ## Format, lint, types, imports, docs, test, test-processes and test-packages

@@ -202,15 +202,8 @@ def demandops(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatc
     return runner(capsys, monkeypatch)
 
 
-@pytest.fixture(scope="session")
-def _all_drivers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drivers]:
-    drivers = Drivers(tmp_path_factory.mktemp("drivers"))
-    yield drivers
-    drivers.close()
-
-
 @pytest.fixture
-def drivers(_all_drivers: Drivers, git_environment: None, synced: bool) -> Iterator[Drivers]:
-    _all_drivers.synced = synced
-    yield _all_drivers
-    _all_drivers.kill_runs()
+def drivers(git_environment: None, synced: bool) -> Iterator[Drivers]:
+    started = Drivers(synced)
+    yield started
+    started.close()

@@ -97,12 +97,14 @@ class DemandAdapter(DeploymentRequestAdapter):
 
 def _text(outcome: Receipt | BaseException) -> str:
     # After success, the first line is ``<outcome>: <commit>``. A line follows for each placed
-    # application, each warning and each listed item that was not held. After a refusal, each fault
+    # application, each effect on releases ("reconfigures of-edge-fusion"), each warning and each
+    # listed item that was not held. After a refusal, each fault
     # has a line ``<code>: <field>: <remedy>``. After another error, the line is ``<code>:
     # <reason>``; for a canceled goal, only the reason.
     if isinstance(outcome, Receipt):
         warnings = (f"warning: {one_line(warning)}" for warning in outcome.warnings)
-        head = [f"{outcome.outcome}: {outcome.commit}", *map(one_line, outcome.placed)]
+        told = map(one_line, (*outcome.placed, *outcome.effects))
+        head = [f"{outcome.outcome}: {outcome.commit}", *told]
         return "\n".join([*head, *warnings, *_not_held(outcome)])
     if isinstance(outcome, InvalidInput):
         return outcome.text_with_codes()

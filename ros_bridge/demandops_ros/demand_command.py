@@ -8,15 +8,20 @@ from functools import partial
 from typing import Any
 
 import click
+from application_manager_interfaces.action import DeploymentRequest
 from demandops.base.errors import DemandOpsError, InvalidInput, fault
 from demandops.base.quoting import one_line
-from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
+from demandops.base.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
+from demandops.model.demand.goals import is_demand_goal
 
+from demandops_ros.actions import GoalSender
 from demandops_ros.client import DemandClient, DemandError, HeldDemand
+from demandops_ros.messages import fill_message
 from demandops_ros.node_parameters import ros_name
 from demandops_ros.ros_process import StopSignals
 
 _TIMEOUT_S = 60.0
+_ACTION_NAMES = (DEFAULT_DEMAND_ACTION_NAME, DEFAULT_ACTION_NAME)
 
 
 @contextmanager
@@ -27,28 +32,39 @@ def sent(
     timeout: float | None,
     tell: Callable[[str], None],
 ) -> Iterator[list[dict[str, Any] | DemandOpsError]]:
-    """Send documents of the kind ``Demand``; yield the answer to each, or its refusal.
+    """Send goals of either action; yield the answer to each, or its refusal.
 
     Held demands are renewed until Ctrl-C, once the block has ended, and released then. If one of
     them is refused, the others are released at once.
     """
     try:
-        name = ros_name(action or DEFAULT_DEMAND_ACTION_NAME)
+        names = [ros_name(action or default) for default in _ACTION_NAMES]
     except ValueError as error:
         raise click.BadParameter(str(error), param_hint="--action") from None
     answers: list[dict[str, Any] | DemandOpsError] = []
     with StopSignals() as signals, ExitStack() as stack:
         for goal in goals:
+            client: DemandClient | GoalSender
             try:
-                client = DemandClient(
-                    *goal.get("requesters", ()), action_name=name, timeout_s=timeout or _TIMEOUT_S
-                )
+                if is_demand_goal(goal):
+                    client = DemandClient(
+                        *goal.get("requesters", ()),
+                        action_name=names[0],
+                        timeout_s=timeout or _TIMEOUT_S,
+                    )
+                else:
+                    client = GoalSender(
+                        DeploymentRequest, names[1], "demandops_client", timeout or _TIMEOUT_S
+                    )
             except Exception as error:  # rclpy raises errors of many kinds
                 message = f"ROS does not start: {one_line(str(error))}"
                 raise click.ClickException(message) from error
-            stack.enter_context(client)
-            put = partial(client.send, goal, lambda stage, text: tell(text))
+            stack.callback(client.close)
             try:
+                if isinstance(client, GoalSender):
+                    answers.append(_requested(client, goal, tell))
+                    continue
+                put = partial(client.send, goal, lambda stage, text: tell(text))
                 if hold:
                     held = stack.enter_context(HeldDemand(client, str(goal.get("demand")), put))
                     assert held.answer is not None  # noqa: S101 - it was put
@@ -75,3 +91,17 @@ def sent(
             signals.wait()
     if hold:
         tell("released")
+
+
+def _requested(
+    sender: GoalSender, goal: Mapping[str, Any], tell: Callable[[str], None]
+) -> dict[str, Any]:
+    # the answer to a goal of the reference's action is text, in the form of `actions._text`
+    message = fill_message(DeploymentRequest.Goal(), dict(goal))
+    succeeded, result, _ = sender.send(message, lambda feedback: tell(feedback.message))
+    head, *lines = result.message.splitlines() or [""]
+    outcome, _, commit = head.partition(": ")
+    if not succeeded:
+        raise DemandError(outcome, result.message)
+    warnings = [line.removeprefix("warning: ") for line in lines]
+    return {"outcome": outcome, "commit": commit or None, "warnings": warnings}

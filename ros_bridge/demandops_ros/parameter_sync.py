@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ from demandops.base.errors import DemandOpsError, InvalidInput, fault
 from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
 from demandops.cluster.watches import ConfigMapWatch
-from rcl_interfaces.srv import SetParameters
+from rcl_interfaces.srv import GetParameterTypes, SetParametersAtomically
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -57,28 +57,61 @@ def _flat(section: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, A
 # A restarted node publishes its parameter events at a new endpoint, which the ROS graph shows.
 
 _LARGEST = 2**63 - 1  # the largest integer that ROS can transport
+_LISTS = {
+    Parameter.Type.BOOL_ARRAY,
+    Parameter.Type.INTEGER_ARRAY,
+    Parameter.Type.DOUBLE_ARRAY,
+    Parameter.Type.STRING_ARRAY,
+}
+_ANSWER_S = 2.0  # a node that does not answer for so long has ended
+# A node may refuse what it takes later, such as a lifecycle node that declares its parameters when
+# it is configured.
+_REFUSED_S = 5.0
+
+
+def as_the_node_has_it(name: str, value: Any, kind: int) -> Parameter:  # noqa: ANN401
+    """Return a parameter with the type that the node has for it; ``kind`` 0 is an unknown one.
+
+    A file does not tell all types: Helm writes 10.0 as 10, and an empty list has none. It stands
+    there as a list of one empty text, too, because ROS's own reader refuses an empty one.
+    """
+    if kind in _LISTS and (value == [] or (value == [""] and kind != Parameter.Type.STRING_ARRAY)):
+        return Parameter(name, Parameter.Type(kind), [])
+    if kind == Parameter.Type.DOUBLE and type(value) is int:
+        value = float(value)
+    kinds = {*map(type, value)} if isinstance(value, list) else set()
+    if kinds == {int, float} or (kinds == {int} and kind == Parameter.Type.DOUBLE_ARRAY):
+        value = [*map(float, value)]
+    return Parameter(name, value=value)
 
 
 class ParameterSetter:
-    """Sets the parameters of the node ``target`` to those of the last call of :meth:`want`."""
+    """Sets the parameters of the node ``target`` to those of the last call of :meth:`want`.
 
-    def __init__(self, node: Node, target: str) -> None:
+    The node takes all of them or none. ``problem`` is why it does not have them; empty if it has.
+    """
+
+    def __init__(self, node: Node, target: str, on_answer: Callable[[], None]) -> None:
         self._node = node
-        self._client = node.create_client(SetParameters, f"{target}/set_parameters")
+        self._types = node.create_client(GetParameterTypes, f"{target}/get_parameter_types")
+        self._set = node.create_client(
+            SetParametersAtomically, f"{target}/set_parameters_atomically"
+        )
         self._target = str(node.resolve_service_name(target))
+        self._on_answer = on_answer
+        self.problem = f"{self._target} has not been asked yet"
         self._lock = REAL.lock()
-        self._wanted: list[Any] = []
+        self._wanted: Mapping[str, Any] = {}
         self._version = 0
-        # the target's endpoints when parameters were last set, and the version of these parameters
-        self._set: tuple[Any, int] | None = None
-        self._call: Any = None
-        self._called_at = 0.0
+        # the target's endpoints when it last answered, and the version of these parameters
+        self._answered: tuple[Any, int] | None = None
+        self._call: tuple[Any, Any] | None = None  # the client, and the future of its answer
+        self._called_at = self._answered_at = 0.0
         self._changed = node.create_guard_condition(self._set_if_needed)
         node.create_timer(0.2, self._set_if_needed)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
         # any thread may call this; TypeError or ValueError names a value that ROS cannot carry
-        wanted = []
         for name, value in parameters.items():
             for number in value if isinstance(value, list) else [value]:
                 if isinstance(number, int) and not -_LARGEST - 1 <= number <= _LARGEST:
@@ -87,12 +120,11 @@ class ParameterSetter:
                         f"number between {-_LARGEST - 1} and {_LARGEST}"
                     )
             try:
-                parameter = Parameter(name, value=value)
+                as_the_node_has_it(name, value, 0)
             except (TypeError, ValueError) as error:
                 raise type(error)(f"parameter {name}: {error}") from None
-            wanted.append(parameter.to_parameter_msg())
         with self._lock:
-            self._wanted, self._version = wanted, self._version + 1
+            self._wanted, self._version = parameters, self._version + 1
         self._changed.trigger()
 
     def _set_if_needed(self) -> None:
@@ -105,45 +137,76 @@ class ParameterSetter:
         )
         with self._lock:
             wanted, version = self._wanted, self._version
+        now = REAL.monotonic()
         if self._call is not None:
-            if REAL.monotonic() - self._called_at < 2.0:
+            if now - self._called_at < _ANSWER_S:
                 return
-            self._client.remove_pending_request(self._call)  # the target ended without an answer
+            client, future = self._call
+            client.remove_pending_request(future)
             self._call = None
-        is_set = self._set == (endpoints, version)
-        if version == 0 or not endpoints or is_set or not self._client.service_is_ready():
+        is_answered = self._answered == (endpoints, version)
+        if is_answered and not (self.problem and now - self._answered_at >= _REFUSED_S):
             return
-        self._called_at = REAL.monotonic()
-        self._call = self._client.call_async(SetParameters.Request(parameters=wanted))
+        is_ready = self._types.service_is_ready() and self._set.service_is_ready()
+        if version == 0 or not endpoints or not is_ready:
+            return
 
-        def take_answer(call: Any) -> None:  # noqa: ANN401
-            if call is not self._call or call.exception() is not None:
-                return
-            self._call, self._set = None, (endpoints, version)
-            names, logger = [parameter.name for parameter in wanted], self._node.get_logger()
-            refused = [
-                f"{name}: {result.reason or 'no reason given'}"
-                for name, result in zip(names, call.result().results, strict=False)
-                if not result.successful
+        def take_types(response: Any) -> None:  # noqa: ANN401
+            # none at all if the node lacks one of the parameters, which it then refuses by name
+            kinds = [*response.types, *[0] * len(wanted)]
+            parameters = [
+                as_the_node_has_it(name, value, kind).to_parameter_msg()
+                for (name, value), kind in zip(wanted.items(), kinds, strict=False)
             ]
-            for line in refused:
-                logger.error(one_line(f"{self._target} refused {line}"))
-            logger.info(f"set {len(names) - len(refused)} parameters of {self._target}")
+            request = SetParametersAtomically.Request(parameters=parameters)
+            self._ask(self._set, request, take_result)
+
+        def take_result(response: Any) -> None:  # noqa: ANN401
+            result, before = response.result, self.problem
+            self._answered, self._answered_at = (endpoints, version), REAL.monotonic()
+            self.problem = ""
+            if not result.successful:
+                reason = result.reason or "no reason given"
+                self.problem = one_line(f"{self._target} refused its parameters: {reason}")
+            if self.problem and (self.problem != before or not is_answered):
+                self._node.get_logger().error(self.problem)
+            elif not self.problem:
+                self._node.get_logger().info(f"set {len(wanted)} parameters of {self._target}")
+            self._on_answer()
             self._changed.trigger()  # other parameters may be wanted by now
 
-        self._call.add_done_callback(take_answer)
+        self._ask(self._types, GetParameterTypes.Request(names=[*wanted]), take_types)
+
+    def _ask(self, client: Any, request: Any, then: Callable[[Any], None]) -> None:  # noqa: ANN401
+        future = client.call_async(request)
+        self._call, self._called_at = (client, future), REAL.monotonic()
+
+        def take(answer: Any) -> None:  # noqa: ANN401
+            if self._call is not None and answer is self._call[1] and answer.exception() is None:
+                self._call = None
+                then(answer.result())
+
+        future.add_done_callback(take)
 
 
 # ---- the command ----
 
-# The names are those of the reference's k8s_configmap_watcher, without its `period`, because a
+
+def _nodes(value: object) -> str:
+    return ",".join(ros_name_or_none(name) for name in node_parameters.text(value).split(","))
+
+
+# The first four are those of the reference's k8s_configmap_watcher, without its `period`, because a
 # watch does not poll.
 _PARAMETERS = {
     "configmap_name": node_parameters.Parameter("", "Name of the ConfigMap."),
     "namespace": node_parameters.Parameter("", "Namespace of the ConfigMap."),
     "ros_params_file_name": node_parameters.Parameter("params.yml", "The key in the ConfigMap."),
     "target_ros_node": node_parameters.Parameter(
-        "", "The node whose parameters are set.", read=ros_name_or_none
+        "", "The node whose parameters are set; several are separated by commas.", read=_nodes
+    ),
+    "state_file": node_parameters.Parameter(
+        "/dev/null", "File that says `set`, or why the nodes do not have the parameters."
     ),
 }
 
@@ -162,10 +225,11 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
     """Keep a ROS node's parameters equal to those in a ConfigMap.
 
     The ConfigMap holds a ROS parameter file. The command sets the parameters of the running node
-    when the ConfigMap changes, and when the node starts again. Everything after --ros-args goes
-    to ROS. The ROS parameters are those of the reference's k8s_configmap_watcher: configmap_name,
-    namespace, ros_params_file_name (the key in the ConfigMap; default params.yml) and
-    target_ros_node. Stop the command with Ctrl-C or SIGTERM.
+    when the ConfigMap changes, and when the node starts again: all at once, or none if the node
+    refuses one. Everything after --ros-args goes to ROS. The ROS parameters are those of the
+    reference's k8s_configmap_watcher: configmap_name, namespace, ros_params_file_name (the key in
+    the ConfigMap; default params.yml) and target_ros_node (several are separated by commas). The
+    file state_file says `set`, or why not, for a probe. Stop the command with Ctrl-C or SIGTERM.
 
     \b
     Examples:
@@ -181,18 +245,33 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
                 raise click.UsageError(
                     f"parameter {name} is not set; use --ros-args -p {name}:=VALUE"
                 )
-        target, key = given["target_ros_node"], given["ros_params_file_name"]
+        key, state_file = given["ros_params_file_name"], Path(given["state_file"])
         file = f"ConfigMap {given['namespace']}/{given['configmap_name']} {key}"
-        setter = ParameterSetter(node, target)
+        unread = dict[str, str]()  # why a node's part of the file cannot be used
+        telling = REAL.lock()  # two threads tell
+
+        def tell() -> None:
+            with telling:
+                problems = [unread.get(name) or each.problem for name, each in setters.items()]
+                state_file.write_text("; ".join(filter(None, problems)) or "set\n", "utf-8")
+
+        setters = {
+            name: ParameterSetter(node, name, tell) for name in given["target_ros_node"].split(",")
+        }
 
         def take(data: Mapping[str, str]) -> None:
-            try:
-                if key not in data:
-                    raise InvalidInput.at("", "is missing; add it to the ConfigMap", file=file)
-                setter.want(parameters_of(target, data[key], file))
-            except (DemandOpsError, TypeError, ValueError) as error:
-                node.get_logger().error(one_line(f"{error}; {target} keeps its parameters"))
+            for target, setter in setters.items():
+                try:
+                    if key not in data:
+                        raise InvalidInput.at("", "is missing; add it to the ConfigMap", file=file)
+                    setter.want(parameters_of(target, data[key], file))
+                    unread.pop(target, None)
+                except (DemandOpsError, TypeError, ValueError) as error:
+                    unread[target] = one_line(f"{error}; {target} keeps its parameters")
+                    node.get_logger().error(unread[target])
+            tell()
 
+        tell()
         watch = ConfigMapWatch(given["namespace"], given["configmap_name"], take, kubeconfig)
         thread = ros_process.ExecutorThread(node)
         signals.wait()

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import permutations, product
-from pathlib import Path
 from typing import Any
 
 from demandops_interfaces.srv import GetBookkeeping
@@ -24,9 +23,7 @@ from tests.kit import goals, plain_yaml
 from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import Client, Sent
 
-RULES: dict[str, list[dict[str, Any]]] = plain_yaml.load(
-    Path(__file__).with_name("rules.yaml").read_text()
-)
+RULES: dict[str, list[dict[str, Any]]] = plain_yaml.beside(__file__, "rules")
 OUTCOMES = ("booked", "unchanged", "released")
 ENDS = {"join": "shutdown", "run": "stop", "put": "release"}
 """For each verb of a step that books something, the verb that ends it."""

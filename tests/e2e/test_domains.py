@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
@@ -20,7 +19,6 @@ from tests.e2e.common.intrusion import (
     ELSEWHERE,
     FORBIDDEN,
     NEIGHBOUR,
-    binding,
     config,
     makers,
     pod,
@@ -28,13 +26,14 @@ from tests.e2e.common.intrusion import (
 )
 from tests.e2e.common.world import World
 from tests.e2e.conftest import MakeWorld, SlipIn
-from tests.e2e.rig.cluster import Gitops, Rig
+from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.components import ARGOCD as CONTROL
-from tests.e2e.rig.kube import Manifest, build_manifest
+from tests.e2e.rig.kube import build_manifest
+from tests.kit import plain_yaml
 
 NODES, POLICY = "inventory/nodes.yaml", "policy/access-domains.yaml"
 ARGOCD = "argoproj.io/v1alpha1"
-CHART = {"kind": "HelmChart", "name": "object-detection-0.1.0"}
+TABLES = plain_yaml.beside(__file__)
 
 
 @pytest.fixture(scope="module")
@@ -61,40 +60,11 @@ def test_a_foreign_namespace_is_refused_and_nothing_else_of_the_commit_is_applie
     assert neighbour.inventory() == untouched
 
 
-PRIVILEGED, BY_POLICY = FORBIDDEN["privileged"]
-REFUSED: dict[str, tuple[Manifest, dict[Gitops, str]]] = {
-    "a kind of the whole cluster": (
-        build_manifest("v1", "Namespace", "foreign"),
-        {"flux": "forbidden", "argocd": "resource :Namespace is not permitted in project"},
-    ),
-    "rights everywhere": (
-        binding("ClusterRoleBinding"),
-        {"flux": "forbidden", "argocd": "ClusterRoleBinding is not permitted in project"},
-    ),
-    "rights at the neighbour's": (
-        binding("RoleBinding", NEIGHBOUR),
-        {"flux": "forbidden", "argocd": f"namespace {NEIGHBOUR} is not permitted in project"},
-    ),
-    "more rights at home": (
-        binding("RoleBinding", "perception"),
-        {"flux": "forbidden", "argocd": "attempting to grant RBAC permissions not currently held"},
-    ),
-    "a kind that the domain may not have": (
-        build_manifest("apps/v1", "DaemonSet", "foreign", "perception", spec={}),
-        {"flux": "forbidden", "argocd": "resource apps:DaemonSet is not permitted in project"},
-    ),
-    "a privileged pod": (
-        next(maker for maker in makers(PRIVILEGED) if maker["kind"] == "Deployment"),
-        {"flux": BY_POLICY, "argocd": BY_POLICY},
-    ),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
+@pytest.mark.parametrize("name", TABLES["refused"])
 def test_it_is_refused_and_services_run_on(
     world: World, neighbour: Domain, slip_in: SlipIn, name: str
 ) -> None:
-    manifest, reason = REFUSED[name]
+    manifest, reason = TABLES["refused"][name].values()
     domain, untouched, before = world.domain, neighbour.inventory(), world.domain.lines()
     slip_in(manifest)
     domain.wait_refused(reason[world.rig.gitops])
@@ -107,46 +77,12 @@ def test_it_is_refused_and_services_run_on(
     assert domain.lines() == before
 
 
-def release(**spec: Any) -> Manifest:
-    spec = {"interval": "10m", "chartRef": CHART, "targetNamespace": NEIGHBOUR, **spec}
-    return build_manifest(
-        "helm.toolkit.fluxcd.io/v2", "HelmRelease", "foreign", "perception", spec=spec
-    )
-
-
-KUSTOMIZATION = build_manifest(
-    "kustomize.toolkit.fluxcd.io/v1",
-    "Kustomization",
-    "foreign",
-    "perception",
-    spec={
-        "interval": "10m",
-        "path": "./clusters",
-        "prune": True,
-        "sourceRef": {"kind": "GitRepository", "name": "demandops"},
-        "targetNamespace": NEIGHBOUR,
-    },
-)
-INTO_ITS_OWN = release(
-    serviceAccountName="demandops",
-    targetNamespace="perception",
-    chartRef={**CHART, "namespace": NEIGHBOUR},
-)
-WAYS_AROUND = {
-    "release elsewhere": (release(serviceAccountName="demandops"), "forbidden"),
-    "release that names no account": (release(), "forbidden"),
-    "release of another account": (release(serviceAccountName="default"), "forbidden"),
-    "Kustomization that names no account": (KUSTOMIZATION, "forbidden"),
-    "a neighbour's chart": (INTO_ITS_OWN, "cross-namespace references are not allowed"),
-}
-
-
 @pytest.mark.only("flux", "objects of Flux; an object of Argo CD names a project instead")
-@pytest.mark.parametrize("way", WAYS_AROUND)
+@pytest.mark.parametrize("way", TABLES["ways around"])
 def test_no_way_around_the_account(
     world: World, neighbour: Domain, slip_in: SlipIn, way: str
 ) -> None:
-    manifest, reason = WAYS_AROUND[way]
+    manifest, reason = TABLES["ways around"][way].values()
     domain, untouched, here = world.domain, neighbour.inventory(), world.domain.inventory()
     slip_in(manifest)
     domain.wait_refused(reason, "foreign")
@@ -184,16 +120,6 @@ def unlimited_project(rig: Rig) -> Iterator[None]:
     rig.kube.delete("AppProject", "default", CONTROL)
 
 
-APPLICATION = {
-    "source": {
-        "path": "appdefs/object-detection-fusion/charts/object-detection",
-        "targetRevision": "main",
-    },
-    "destination": {"server": "https://kubernetes.default.svc", "namespace": NEIGHBOUR},
-    "syncPolicy": {"automated": {}},
-}
-
-
 @pytest.mark.only("argocd", "a release of Flux has an account, but no project")
 @pytest.mark.parametrize(
     ("kind", "project", "namespace", "reason"),
@@ -216,7 +142,7 @@ def test_a_release_cannot_leave_its_namespace(
 ) -> None:
     domain, spec = world.domain, {}
     if project:
-        spec = {"project": project, **APPLICATION}
+        spec = {"project": project, **TABLES["application"]}
         spec["source"] = spec["source"] | {"repoURL": world.url}
     slip_in(build_manifest(ARGOCD, kind, "foreign", namespace, spec=spec))
     domain.wait_refused(reason, "foreign")

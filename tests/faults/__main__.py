@@ -11,6 +11,7 @@ import io
 import json
 import logging
 import os
+import pkgutil
 import sys
 import tempfile
 import time
@@ -19,17 +20,18 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
+from importlib import import_module
 from multiprocessing import current_process, get_context
 from pathlib import Path
 from typing import Any
 
+import demandops
 from demandops.cli import main as command_line
 
 from tests.faults import disk, injection, power_loss
 from tests.faults.injection import Result
 from tests.faults.invariants import DEMAND
 from tests.faults.rig import Rig
-from tests.kit.warm_commands import import_all
 
 WORKERS = (os.cpu_count() or 1) + 1
 """One more than there are cores, because a worker that waits for a disk or a lock needs no core."""
@@ -78,7 +80,8 @@ def main() -> int:
 
 def _prepare(folder: Path) -> None:
     """Import all modules, and compile templates and schemas, so that forked processes need not."""
-    import_all()
+    for module in pkgutil.walk_packages(demandops.__path__, "demandops."):
+        import_module(module.name)
     rig = Rig(folder / "first", remote=False)
     state = ("--state-repo", str(rig.state))
     for command in (("verify",), ("request", str(rig.goal_file(DEMAND)), "--dry-run")):

@@ -17,7 +17,7 @@ _CALL = re.compile(r"(\w+)\((.*)\) += (-?\d+|\?|0x[0-9a-f]+)(.*)", re.DOTALL)
 _TEXT = re.compile(r'"((?:[^"\\]|\\.)*)"')
 _FILE = re.compile(r"(?:AT_FDCWD|\d+)<((?:[^>\\]|\\.)*)>")
 _NAME_IN = re.compile(rf"{_FILE.pattern}, {_TEXT.pattern}")
-_TRAITS = plain_yaml.load(Path(__file__).with_name("calls.yaml").read_text())
+_TRAITS = plain_yaml.beside(__file__, "calls")
 _FORKS = ("clone", "clone3", "fork", "vfork")
 _RANDOM = (
     (re.compile(r"\b[0-9a-f]{2}/[0-9a-f]{38}\b"), "??/*"),

@@ -50,7 +50,7 @@ from tests.kit.memory import NOW
 from tests.unit.cluster.cases import Letters
 from tests.unit.demand.test_fuzz import ANYTHING, KEY, TEXT, assert_told, outcome
 
-_SEEDS = plain_yaml.load(Path(__file__).with_name("seeds.yaml").read_text())
+_SEEDS = plain_yaml.beside(__file__, "seeds")
 _BOOKED = sorted(golden.GOLDEN.rglob("expected/*/ledger/**/*.yaml"))
 _GOALS = [*EXPERIMENT, *golden.GOLDEN.glob("*/requests/*.yaml")]
 

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from demandops.cli.main import run as run_command
-from demandops.model.ledger.claim import read
 
 from tests.golden.cases import GOLDEN, requests_of
 from tests.integration.conftest import On
-from tests.kit.goals import APP, EXPERIMENT, connection, goal
-from tests.kit.repo import FORGER, GitRepo, git
+from tests.kit.goals import APP, EXPERIMENT
+from tests.kit.repo import GitRepo, git
 
 ROOT = Path(__file__).parents[2]
 DETECTION = "od-edge-vehicle00"
@@ -103,102 +100,3 @@ def test_one_thing_has_the_documented_keys_in_every_command(on: On, played: GitR
     assert keys["changed release"] == [*changed["releases"][0]] == [*back["releases"][0]]
     assert keys["changed entry of the bookkeeping"] == [*changed["bookkeeping"][0]]
     assert keys["fault"] == [*failed.json()["faults"][0]]
-
-
-def test_a_rollback_gives_back_books_and_files(on: On, played: GitRepo) -> None:
-    git(played, "config", "user.name", "Ada <A>")
-    git(played, "config", "user.email", "ada@example.org")
-    wanted = git(played, "rev-parse", "main~2:ledger", "main~2:clusters")
-    before, back = played.tip, ("rollback", "main~2", "--yes")
-    dry = on(*back, "--output", "json", "--dry-run").json()
-    assert (played.tip, dry["commit"]) == (before, None)
-    found = on(*back, "--output", "json", "-m", "they left\nby mistake").json()
-    assert found == dry | {"commit": played.tip, "outcome": "restored"}
-    assert git(played, "rev-parse", "main:ledger", "main:clusters") == wanted
-    assert (found["dropped"], found["changed_back"]) == ([], [])
-    assert {*map(tuple, (one["requesters"] for one in found["restored"]))} == {
-        *(("station00", vehicle) for vehicle in ("vehicle00", "vehicle01"))
-    }
-    assert f"+ {DETECTION}" in git(played, "log", "-1", "--format=%b", "main")
-    trailers = "%(trailers:key=Operation,key=Restores,key=Reason,valueonly,separator=%x2C)"
-    said = git(played, "log", "-1", f"--format=%an|%ae|{trailers}", "main")
-    trailers = f"rollback,{found['to']},they left by mistake"
-    assert said == f"Ada (A)|ada@example.org|{trailers}"
-    assert [row["commit"] for row in on.json("log", "--operation", "rollback")] == [played.tip]
-    assert on("verify").code == 0
-    other = git(played, "commit-tree", "-m", "other", f"{played.tip}^{{tree}}")
-    ran = on("rollback", other, "-m", "x", "-y")
-    assert ran.code == 1 and f"commit {other} is not in the history" in ran.err
-
-
-FORGED = "Forged\n\nOperation: join\nDemand-Id: none\nRender-Version: 3\n"
-Changed = dict[str, str | None]
-
-
-class TestVerifyByDifferences:
-    """`verify` checks a range of commits by the differences between them."""
-
-    @pytest.fixture
-    def verdict(self, on: On, played: GitRepo) -> Callable[..., Any]:
-        def of(changed: Changed | Callable[[], Changed], *by: Any) -> Any:
-            """Return the row of a commit between demands; `--whole` must give the same rows."""
-            on.request(goal([], [connection("before-1")]), goal([], [connection("before-2")]))
-            made = played.commit(changed() if callable(changed) else changed, *by)
-            on.request(goal([], [connection("after")]))
-            where = ("verify", "main~4..main", "--output", "json")
-            ran = on(*where)
-            assert on(*where, "--whole") == ran
-            (row,) = [row for row in ran.json() if row["commit"] == made]
-            failing = [row for row in ran.json() if not row["holds"]]
-            assert ran.code == (1 if failing else 0)
-            assert failing[:1] in ([], [row])
-            return row
-
-        return of
-
-    def test_what_differs_from_the_ledger(
-        self, played: GitRepo, verdict: Callable[..., Any]
-    ) -> None:
-        path = f"{EDGE}/{FUSION}.yaml"
-        row = verdict({path: played.files()[path] + "# changed\n"}, FORGED, FORGER)
-        assert row["differing"] == [path]
-
-    def test_a_claim_removed_without_the_files_that_only_it_needed(
-        self, played: GitRepo, verdict: Callable[..., Any]
-    ) -> None:
-        path = next(p for p, t in played.files("ledger/connections/").items() if "vehicle02/" in t)
-        text = FORGED.replace("none", read(played.files()[path], path).demand)
-        row = verdict({path: None}, text, FORGER)
-        assert ["vehicle02" in left for left in row["differing"]] == [True, True]
-        assert not row["touched"]
-
-    def test_what_a_person_changed_holds(
-        self, played: GitRepo, verdict: Callable[..., Any]
-    ) -> None:
-        assert verdict({IMAGES: played.files()[IMAGES].replace("2025-04", "2025-05")})["holds"]
-        for_a_folder = {"ledger": "a file\n"}
-        assert verdict(lambda: dict.fromkeys(played.files("ledger/")) | for_a_folder)["holds"]
-
-    @pytest.mark.parametrize(
-        ("path", "operation"),
-        [
-            ("policy/access-domains.yaml", "join"),
-            ("ledger/connections/00/x-0/y-0.yaml", "join"),
-            ("overrides/a", "join"),
-            ("ledger/overrides/x.yaml", "put"),
-            ("ledger/shutdowns/x.yaml", "put"),
-            ("appdefs/object-detection-fusion/appdef.yaml", "upgrade"),
-            ("claim", "join"),  # of the demand that the commit names, but with a comment
-            ("claim", "follow"),  # of a demand that the commit does not name
-        ],
-    )
-    def test_what_is_not_the_generators_to_write(
-        self, played: GitRepo, verdict: Callable[..., Any], path: str, operation: str
-    ) -> None:
-        files, message = played.files(), FORGED.replace("join", operation)
-        if path == "claim":
-            path = next(iter(played.files("ledger/connections/")))
-            demand = read(files[path], path).demand
-            message = message.replace("none", demand if operation == "join" else "none")
-        row = verdict({path: files.get(path, "# nothing\n") + "# more\n"}, message, FORGER)
-        assert (row["holds"], row["touched"]) == (False, [path])

@@ -11,7 +11,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pygit2
 import pytest
 import yaml
 from demandops.base.errors import Unsound
@@ -20,59 +19,9 @@ from demandops.cli.queries import commits
 from tests.integration.conftest import On
 from tests.kit.cli import Ran, Run
 from tests.kit.goals import perception
-from tests.kit.repo import FORGER, GitRepo, git
+from tests.kit.repo import git
 
 GIVEN = yaml.safe_dump(perception())
-
-
-def test_init_makes_a_bare_repo_or_fills_an_empty_working_directory(
-    demandops: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ran = demandops("init", tmp_path / "state.git", "--bare")
-    assert (ran.code, ran.err) == (0, "")
-    repo = pygit2.Repository(str(tmp_path / "state.git"))
-    assert (repo.is_bare, repo.references["HEAD"].target) == (True, "refs/heads/main")
-    assert str(repo.references["refs/heads/main"].target)[:10] in ran.out
-    (tmp_path / "outer" / "inner").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path / "outer")
-    assert demandops("init", "inner/..").code == 1
-    monkeypatch.chdir(tmp_path / "outer" / "inner")
-    assert demandops("init", ".").code == 0
-    assert not git(".", "status", "--porcelain")
-
-
-def test_a_command_that_fails_prints_its_faults_as_json(demandops: Run, tmp_path: Path) -> None:
-    for command in (
-        "bookkeeping", "decommission n", "diff a b", "get overrides", "get proposals", "log",
-        "rollback r -m why", "status", "upgrade", "verify", "why n",
-    ):  # fmt: skip
-        where = (*command.split(), "--state-repo", tmp_path / "none")
-        told, text = demandops(*where, "-o", "json"), demandops(*where)
-        (fault,) = told.json()["faults"]
-        assert (told.code, text.code, text.out) == (1, 1, "")
-        assert list(fault) == ["code", "field", "message", "file", "line"]
-        assert told.err == text.err == f"error: {fault['message']}\n"
-
-
-class TestVerify:
-    def test_what_was_tampered_with_does_not_hold(self, on: On, state: GitRepo) -> None:
-        on.book(perception())
-        (path,) = (path for path in state.manifests() if "/od-" in path)
-        changed = {path: state.files()[path] + "# changed\n"}
-        state.commit(changed, "Forged\n\nOperation: join\nRender-Version: 3\n", FORGER)
-        ran = on("verify")
-        assert ran.code == 1
-        assert ran.out.splitlines() == [
-            f"{state.tip[:10]} DIFFERS  Forged",
-            f"    {path}",
-            "0 of 1 commits are verified",
-        ]
-        (row,) = on("verify", "--output", "json").json()
-        assert row == {
-            "commit": state.tip, "summary": "Forged", "holds": False, "skipped": None,
-            "faults": [], "differing": [path], "touched": [],
-            "signed": False, "signer": None, "signature": None,
-        }  # fmt: skip
 
 
 @pytest.mark.parametrize("command", ["bookkeeping", "request -"])
@@ -132,10 +81,3 @@ class TestProcess:
         ran = self.run("get", "nodes", "--state-repo", str(bare), PATH=str(tmp_path))
         assert ran.code == 1
         assert ran.err.startswith("error: get needs git, which is not installed; install it")
-
-
-def test_a_clone_has_the_state_repos_kind_of_ids_whatever_the_users_default_is(
-    bare: Path, monkeypatch: pytest.MonkeyPatch, demandops: Run
-) -> None:
-    monkeypatch.setenv("GIT_DEFAULT_HASH", "sha256")
-    assert demandops("get", "nodes", "--state-repo", bare.as_uri()).code == 0

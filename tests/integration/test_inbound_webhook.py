@@ -18,10 +18,12 @@ from demandops.base.errors import InvalidInput
 from demandops.serve import http_server
 from demandops.serve.http_server import PushWebhook
 
+from tests.kit import plain_yaml
 from tests.kit.limits import LONGEST_TEST_S, PATIENCE_S
 
 SECRET = b"s3cret-of-the-hook"
 BODY = b'{"ref": "refs/heads/main"}'
+ADDRESSES = plain_yaml.beside(__file__)
 POST = b"POST /push HTTP/1.1\r\nHost: x\r\n"
 
 
@@ -215,30 +217,15 @@ def test_a_close_waits_for_no_slow_sender(
         connected(signed)
 
 
-# # ---- the options at the start ----
-
-NO_ADDRESS = "is not an address to listen on"
+# ---- the options at the start ----
 
 
-@pytest.mark.parametrize(
-    ("address", "told"),
-    [
-        ("8090", f"'8090' {NO_ADDRESS}"),
-        (":8090", f"':8090' {NO_ADDRESS}"),
-        ("localhost:http", f"'localhost:http' {NO_ADDRESS}"),
-        ("127.0.0.1:65536", f"'127.0.0.1:65536' {NO_ADDRESS}"),
-        ("::" + "1" * 5000, f"'::{'1' * 77}…' {NO_ADDRESS}"),
-        ("0.0.0.0:0", "'0.0.0.0:0' can be reached from other machines"),
-        ("nowhere.invalid:0", "'nowhere.invalid:0': host 'nowhere.invalid' cannot be resolved"),
-        ("192.0.2.1:0", "cannot listen on '192.0.2.1:0': Cannot assign requested address"),
-        ("", "cannot listen on '{taken}': Address already"),
-    ],
-)
+@pytest.mark.parametrize(("address", "told"), ADDRESSES)
 def test_an_address_that_will_not_do_is_told(
     unsigned: PushWebhook, address: str, told: str
 ) -> None:
     taken = urlsplit(unsigned.url).netloc
     with pytest.raises(InvalidInput) as error:
         PushWebhook(address or taken, b"", lambda: None)
-    assert str(error.value).startswith(f"--webhook: {told.format(taken=taken)}")
+    assert str(error.value).startswith(f"--webhook: {told.replace('TAKEN', taken)}")
     PushWebhook("0.0.0.0:0", SECRET, lambda: None).close()  # for signed notifications

@@ -1,4 +1,4 @@
-"""Demands that need approval are awaited, approved and rejected; see ``stories/people.yaml``."""
+"""Demands that need approval are awaited, approved and rejected; see ``stories/proposals.yaml``."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pygit2
 import pytest
 
 from tests.integration.conftest import On
-from tests.kit.cli import Dialogue, Run
+from tests.kit.cli import Dialogue
 from tests.kit.goals import perception, put
 from tests.kit.repo import GENERATOR_EMAIL, GENERATOR_NAME, GitRepo, Person, branches, git
-from tests.kit.rig import running, wait_until
+from tests.kit.rig import wait_until
 
 VISIT, OTHER = put("visit"), put("visit", topic=("/other", "vehicle00"))
 
@@ -75,34 +75,6 @@ def test_a_branch_of_a_time_that_no_calendar_has_is_listed(on: On, state: GitRep
     assert [row["branch"] for row in on.json("get", "proposals")["items"]] == ["demand/odd"]
 
 
-@pytest.mark.parametrize("scheme", ["", "file://"])
-def test_one_is_approved_in_ones_own_name(
-    demandops: Run, on: On, state: GitRepo, branch: str, scheme: str
-) -> None:
-    head, where = at(state, branch), ("--state-repo", f"{scheme}{state.path}")
-    told = demandops("approve", "nothing", "--commit", "0" * 40, *where).err
-    assert told == f"error: no proposal fits 'nothing'; known: {branch}\n"
-    ran = demandops("approve", "visit", "-m", "Agreed #1", "--commit", head, *where)
-    assert ran.code == 0, ran.err
-    assert ran.out == f"approved: {branch} is merged in {state.tip}\n"
-    assert git(state, "log", "-1", "--format=%an|%b") == "Petra Platform|Agreed #1\n"
-    assert at(state, "main^2") == head
-    with running(state.path, fetch_interval=0.05):
-        wait_until(lambda: not branches(state.path), "the generator removes the branch")
-    (demand,) = on.json("get", "demands")["items"]
-    assert demand["requests"] == ["visit"]
-    assert on("verify", "main~1..main").code == 0
-
-
-def test_one_that_no_longer_fits_is_left_to_the_generator(
-    on: On, state: GitRepo, branch: str
-) -> None:
-    path = git(state, "diff", "--name-only", "main", branch, "--", "ledger").split("\n")[0]
-    state.commit({path: "mine\n"})
-    told = on.refused("approve", "visit", "--commit", at(state, branch))
-    assert "wait until a running generator has made the branch anew, then try again" in told
-
-
 def test_what_is_more_than_demands_is_listed_and_no_name_of_a_file_adds_lines(
     strict: GitRepo, person: Person, branch: str
 ) -> None:
@@ -158,12 +130,13 @@ def test_a_proposal_that_has_changed_since_it_was_seen_is_left_alone(
     (branch,) = branches(strict.path)
     now = at(strict, branch)
     assert now != seen
-    told = on.refused(command, "visit", "--commit", seen)
+    told = on.refused(command, "visit", "--commit", seen, "-m", "Why")
     assert f"is at commit {now}, not at '{seen}'; if it has changed since" in told
     for other in (now[:39], now.upper(), "HEAD", f"{now[:12]}~0", f"{now}0"):
-        on.refused(command, "visit", "--commit", other)
+        on.refused(command, "visit", "--commit", other, "-m", "Why")
+    assert "give the whole id" in on.refused(command, "visit", "--commit", now[:10], "-m", "Why")
     assert at(strict, branch) == now
-    ran = on(command, "visit", "--commit", now)
+    ran = on(command, "visit", "--commit", now, "-m", "Why")
     assert ran.code == 0, ran.err
     assert command == "reject" or at(strict, "main^2") == now
     assert "changed: it replaces demand/visit-" in ran.err and seen in ran.err
@@ -195,3 +168,13 @@ def test_what_changes_while_a_person_looks_at_it_is_not_merged(
         told = " ".join(asked.text.split())  # the terminal has wrapped it
         assert f"{branch} is no longer at commit {seen}, so nothing was changed" in told
     assert strict.tip == main
+
+
+def test_at_a_terminal_a_rejection_asks_why(strict: GitRepo, branch: str) -> None:
+    with Dialogue("reject", branch, "--state-repo", strict.path) as asked:
+        for question, answer in (("Why: ", "Out of hours"), ("Reject it? [y/N]:", "y")):
+            asked.read_until(question)
+            asked.type(f"{answer}\n")
+        assert asked.end() == 0, asked.text
+    reason = git(strict, "log", "-1", "--format=%(trailers:key=Reason,valueonly)", "main")
+    assert reason.strip() == "Out of hours"

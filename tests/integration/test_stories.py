@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from string import Template
@@ -42,6 +43,10 @@ class Step(FrozenModel):
     """What a person edits in the clone ``$clone``, which the first use makes."""
     git: list[str] = Field(default_factory=list)
     """Commands of git in the clone."""
+    links: dict[str, str] = Field(default_factory=dict)
+    """Links in the clone, by path; each replaces what is there."""
+    notes: dict[str, str] = Field(default_factory=dict)
+    """More names for the later steps, such as `seen: $head`."""
     run: str = ""
     """The command. Those that take a state repo get ``--state-repo $repo``, unless `inside` says in
     which folder of the clone, or `environment` with which variables, the command runs.
@@ -118,7 +123,10 @@ class Teller:
         words["branch"] = next(iter(branches(repo, "demand/", "override/")), "main")  # a proposal's
         words["head"] = git(repo, "rev-parse", words["branch"])
         words |= {"tip": self.repo.tip, "clone": str(self.clone), "folder": str(self._folder)}
-        step = Step.model_validate(_filled(told, words | self._names))
+        words |= self._keys(str(told))
+        names = {name: _filled(text, words) for name, text in self._names.items()}
+        step = Step.model_validate(_filled(told, words | names))
+        self._names = self._names | step.notes
         send(repo, step.sends)
         if step.commits:
             texts = self.repo.files()
@@ -134,6 +142,10 @@ class Teller:
             _ = file.unlink() if new is None else file.write_text(new)
         for command in step.git:
             git(self.clone, *shlex.split(command))
+        for path, target in step.links.items():
+            link = self.clone / path
+            _ = shutil.rmtree(link) if link.is_dir() else link.unlink(missing_ok=True)
+            link.symlink_to(target)
         with patch.context() as own:
             if step.inside:
                 own.chdir(self.clone / step.inside)
@@ -141,6 +153,19 @@ class Teller:
                 own.setenv(variable, value)
             if step.run:
                 self._check(step)
+
+    def _keys(self, told: str) -> dict[str, str]:
+        """Return the SSH keys that a step or its names use, which the first use makes."""
+        words = {}
+        for name in ("key", "other"):
+            file = self._folder / name
+            if f"${name}" in told and not file.exists():
+                make = ("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", str(file))
+                subprocess.run(make, check=True)
+            if file.exists():
+                public = file.with_suffix(".pub").read_text()
+                words |= {name: str(file), f"{name}_public": public}
+        return words
 
     def _check(self, step: Step) -> None:
         args, before = shlex.split(step.run), self.repo.tip

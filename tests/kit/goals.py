@@ -121,10 +121,15 @@ def link(number: int, **more: Any) -> Goal:
 
 
 def put(
-    demand: str, *who: str, topic: Topic = ("/ego", "vehicle00"), node: str = "edge", **more: Any
+    demand: str,
+    *who: str,
+    id: str = "",
+    topic: Topic = ("/ego", "vehicle00"),
+    node: str = "edge",
+    **more: Any,
 ) -> Goal:
     inputs = {"ego_data": [{"topic": topic[0], "source": topic[1]}]}
-    item = {"id": f"edge/{demand[:100]}", "type": "object-detection-fusion", "node": node}
+    item = {"id": id or f"edge/{demand[:100]}", "type": "object-detection-fusion", "node": node}
     item |= {"inputs": inputs} | ({"connect": more.pop("connect")} if "connect" in more else {})
     made = {"kind": "Demand", "demand": demand, "requesters": list(who or ["vehicle00"])}
     return made | {"applications": [item]} | more

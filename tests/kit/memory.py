@@ -29,7 +29,6 @@ from tests.kit import plain_yaml
 from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.goals import Goal
 from tests.kit.plain_yaml import FAST
-from tests.model.view import in_model_words, object_lists
 
 NOW = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
 
@@ -129,10 +128,6 @@ class MemoryRepo:
     def books(self) -> dict[str, Any]:
         data = self.bookkeeping()
         return {"services": data["services"], "connections": data["connections"]}
-
-    def view(self) -> dict[str, Any]:
-        """Return the bookkeeping in the form of ``tests.model.view``."""
-        return in_model_words(self.bookkeeping(), object_lists(self.below("clusters").values()))
 
     def below(self, *roots: str) -> dict[str, str]:
         return {

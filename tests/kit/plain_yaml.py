@@ -19,6 +19,6 @@ def dump(data: Any) -> str:
     return str(yaml.dump(data, Dumper=_DUMPER))
 
 
-def beside(test_file: str) -> Any:
-    """Return what the YAML file of the same name beside a test's file says."""
-    return load(Path(test_file).with_suffix(".yaml").read_text())
+def beside(test_file: str, name: str = "") -> Any:
+    """Return what a YAML file beside a test's file says, by default that of the same name."""
+    return load(Path(test_file).with_name(f"{name or Path(test_file).stem}.yaml").read_text())

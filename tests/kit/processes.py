@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from demandops.serve import agenda
 from demandops.serve.generator import Generator
-from demandops.serve.journal import Journal, Receipt, Ticket
+from demandops.serve.journal import Journal
 
 from tests.kit.goals import Goal
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import GIT_ENVIRONMENT, force_writes
+from tests.kit.repo import force_writes
 
 _CHECKOUT = Path(__file__).parents[2]
-_SOURCES = (_CHECKOUT, _CHECKOUT / "generator", _CHECKOUT / "ros_bridge")
 
 
 def demand(name: str, made: Goal, operation: str | None = None) -> dict[str, Any]:
@@ -35,56 +32,41 @@ def demand(name: str, made: Goal, operation: str | None = None) -> dict[str, Any
 
 @dataclass
 class Told:
-    sent: list[str] = field(default_factory=list)
     answers: dict[str, dict[str, Any]] = field(default_factory=dict)
     finished: bool | None = None
+    """Whether the generator had published everything when it was closed; None if it was killed."""
 
 
-class Run:
-    """A generator's process, and the events that it reports."""
+Run = subprocess.Popen[str]
 
-    def __init__(self, pipe: Path) -> None:
-        self._pipe = pipe
-        self._told = Told()
-        self._ended = False
-        self.pid = 0
 
-    def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
-        """Return all events at the end; ``on_ready`` is called when the process takes demands."""
-        with self._pipe.open() as lines:
-            for line in lines:
-                event = json.loads(line)
-                if "ready" in event:
-                    self.pid = event["ready"]
-                    on_ready()
-                elif "sent" in event:
-                    self._told.sent.append(event["sent"])
-                elif "answer" in event:
-                    self._told.answers[event["answer"]] = event
-                elif "failed" in event:
-                    raise AssertionError(f"the driver failed: {event['failed']}")
-                else:
-                    self._told.finished = event["finished"]
-            self._ended = True
-        return self._told
+def listen(run: Run, on_ready: Callable[[], object] = lambda: None) -> Told:
+    """Return all events of a run at its end; ``on_ready`` is called when it takes demands."""
+    told = Told()
+    assert run.stdout is not None
+    for line in run.stdout:
+        event = json.loads(line)
+        if "ready" in event:
+            on_ready()
+        elif "answer" in event:
+            told.answers[event["answer"]] = event
+        else:
+            told.finished = event["finished"]
+    assert run.wait(PATIENCE_S) in (0, -signal.SIGKILL)
+    return told
 
-    def kill(self) -> None:
-        if self.pid and not self._ended:
-            with suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)
+
+def listen_to_all(runs: list[Run], on_ready: Callable[[], object] = lambda: None) -> list[Told]:
+    """Return the events of all runs at their end; ``on_ready`` is called when all have started."""
+    waited_for = threading.Barrier(len(runs), on_ready)
+    with ThreadPoolExecutor(len(runs)) as pool:
+        return list(pool.map(lambda run: listen(run, lambda: waited_for.wait(PATIENCE_S)), runs))
 
 
 class Drivers:
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, synced: bool) -> None:
+        self._synced = synced
         self._runs: list[Run] = []
-        self.synced = False
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.kit.processes"],
-            stdin=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, _SOURCES))},
-        )
 
     def start(
         self,
@@ -94,47 +76,31 @@ class Drivers:
         dies: bool = False,
         cwd: Path | None = None,
     ) -> Run:
-        """Start a generator; if it ``dies``, it does so once its first demands are journaled."""
-        pipe = self._folder / f"run-{len(list(self._folder.iterdir()))}"
-        os.mkfifo(pipe)
-        names = [*GIT_ENVIRONMENT, "DEMANDOPS_DATA_HOME"]
-        plan = {
-            "address": str(address),
-            "lanes": lanes,
-            "dies": dies,
-            "synced": self.synced,
-            "cwd": str(cwd or Path.cwd()),
-            "environment": {name: os.environ[name] for name in names},
-            "to": str(pipe),
-        }
-        assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(plan) + "\n")
-        self._process.stdin.flush()
-        self._runs.append(Run(pipe))
-        return self._runs[-1]
+        """Start a generator; if it ``dies``, it does so once its first demands are journaled.
 
-    def kill_runs(self) -> None:
-        while self._runs:
-            self._runs.pop().kill()
+        Its ``lanes`` are clients, each a list of demands. A client waits for an answer before it
+        sends its next demand.
+        """
+        plan = {"address": str(address), "lanes": lanes, "dies": dies, "synced": self._synced}
+        roots = (_CHECKOUT, _CHECKOUT / "generator", _CHECKOUT / "ros_bridge")
+        run = subprocess.Popen(
+            [sys.executable, "-m", "tests.kit.processes"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=cwd,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, roots))},
+        )
+        self._runs.append(run)
+        assert run.stdin is not None
+        run.stdin.write(json.dumps(plan))
+        run.stdin.close()
+        return run
 
     def close(self) -> None:
-        self.kill_runs()
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait()
-
-
-def listen_to_all(
-    drivers: Drivers, runs: list[Run], on_ready: Callable[[], object] = lambda: None
-) -> list[Told]:
-    """Return the events of all runs at their end; ``on_ready`` is called when all have started."""
-    waited_for = threading.Barrier(len(runs), on_ready)
-    with ThreadPoolExecutor(len(runs)) as pool:
-        try:
-            return list(pool.map(lambda run: run.listen(lambda: waited_for.wait(PATIENCE_S)), runs))
-        except BaseException:
-            drivers.kill_runs()  # otherwise the pool would wait for the runs for ever
-            raise
+        for run in self._runs:
+            run.kill()
+            run.wait()
 
 
 # ---- the program ----
@@ -142,7 +108,7 @@ def listen_to_all(
 
 def tell(**event: object) -> None:
     # a write of this size to a pipe is atomic, so lines of different threads do not mix
-    os.write(1, (json.dumps(event)[:4000] + "\n").encode())
+    os.write(1, (json.dumps(event) + "\n").encode())
 
 
 def die_once_journaled() -> None:
@@ -156,80 +122,27 @@ def die_once_journaled() -> None:
     Journal.append = append_and_die  # type: ignore[method-assign]
 
 
-class Lanes:
-    def __init__(self, generator: Generator, lanes: list[list[dict[str, Any]]]) -> None:
-        self._generator = generator
-        self._lanes = [lane for lane in lanes if lane]
-        self._left = len(self._lanes)
-        self._lock = threading.Lock()
-        self.ended = threading.Event()
-        if not self._left:
-            self.ended.set()
-
-    def start(self) -> None:
-        """Send the first demand of each lane; return when all of these are in the journal."""
-        wait([ticket.journaled for lane in self._lanes if (ticket := self._next(lane, 0))])
-
-    def _next(self, lane: list[dict[str, Any]], index: int) -> Ticket | None:
-        if index == len(lane):
-            with self._lock:
-                self._left -= 1
-                if not self._left:
-                    self.ended.set()
-            return None
-        tell(sent=lane[index]["name"])
-        ticket = self._generator.submit(lane[index]["goal"], lane[index]["operation"])
-        ticket.future.add_done_callback(lambda future: self._answered(lane, index, future))
-        return ticket
-
-    def _answered(self, lane: list[dict[str, Any]], index: int, future: Future[Receipt]) -> None:
-        tell_answer(lane[index]["name"], future)
-        self._next(lane, index + 1)
-
-
-def tell_answer(name: str, future: Future[Receipt]) -> None:
-    if error := future.exception():
-        tell(answer=name, outcome=type(error).__name__, text=str(error), commit="")
-    else:
-        tell(answer=name, outcome=future.result().outcome, text="", commit=future.result().commit)
-
-
-def run(plan: dict[str, Any]) -> None:
+def main() -> None:
+    plan = json.load(sys.stdin)
     force_writes(plan["synced"])
     agenda.LONGEST_EVALUATION_S = 60.0  # so that no slow machine publishes a batch in two parts
     if plan["dies"]:
         die_once_journaled()
     generator = Generator(plan["address"])
-    tell(ready=os.getpid())
-    lanes = Lanes(generator, plan["lanes"])
-    lanes.start()
-    lanes.ended.wait()
+    tell(ready=True)
+
+    def play(lane: list[dict[str, Any]]) -> None:
+        for one in lane:
+            future = generator.submit(one["goal"], one["operation"]).future
+            if error := future.exception():
+                tell(answer=one["name"], outcome=type(error).__name__, commit="")
+            else:
+                receipt = future.result()
+                tell(answer=one["name"], outcome=receipt.outcome, commit=receipt.commit)
+
+    with ThreadPoolExecutor(len(plan["lanes"])) as pool:
+        list(pool.map(play, plan["lanes"]))
     tell(finished=generator.close(PATIENCE_S))
-
-
-def main() -> None:
-    """Import all modules once, and fork for every run; a run prints its events as lines of JSON.
-
-    Each run comes from standard input, as one line of JSON. Its ``lanes`` are clients, each a list
-    of demands. A client waits for an answer before it sends its next demand.
-    """
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr)
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for ended runs
-    for line in sys.stdin:
-        if os.fork():
-            continue
-        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-        plan = json.loads(line)
-        os.environ.update(plan["environment"])
-        os.chdir(plan["cwd"])
-        os.dup2(os.open(plan["to"], os.O_WRONLY), 1)
-        try:
-            run(plan)
-        except BaseException as error:
-            logging.exception("the run ended early")
-            tell(failed=repr(error))
-        finally:
-            os._exit(0)
 
 
 if __name__ == "__main__":

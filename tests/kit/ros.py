@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,9 +32,6 @@ from rclpy.executors import SingleThreadedExecutor
 from unique_identifier_msgs.msg import UUID
 
 from tests.kit.limits import PATIENCE_S
-from tests.kit.warm_commands import WarmCommand, WarmCommands
-
-Process = subprocess.Popen[str] | WarmCommand
 
 STATUS = {
     GoalStatus.STATUS_SUCCEEDED: "succeeded",
@@ -78,7 +75,7 @@ def _is_free(domain: int) -> bool:
 class Served:
     """A running `demandops serve`."""
 
-    process: Process
+    process: subprocess.Popen[str]
     state_repo: str
     log: Path
     environment: dict[str, str]
@@ -119,12 +116,10 @@ Serve = Callable[..., Served]
 
 
 class Servers:
-    """Starts `demandops serve` in one ROS domain, with ``warm`` as forks, which start faster."""
+    """Starts `demandops serve` and other commands in one ROS domain."""
 
-    def __init__(
-        self, folder: Path, domain: int, warm: WarmCommands | None = None, **environment: str
-    ) -> None:
-        self._folder, self._domain, self._warm = folder, domain, warm
+    def __init__(self, folder: Path, domain: int, **environment: str) -> None:
+        self._folder, self._domain = folder, domain
         self._environment = environment
         self._started: list[Served] = []
 
@@ -140,19 +135,13 @@ class Servers:
             "PYTHONFAULTHANDLER": "1",
             **self._environment,
         }
-        process = self._process(words, environment, log)
-        self._started.append(Served(process, state_repo, log, environment, self._domain))
-        return self._started[-1]
-
-    def _process(self, words: Sequence[str], environment: dict[str, str], log: Path) -> Process:
-        log.touch()
-        if self._warm:
-            return self._warm.start(words, environment, log)
         command = [sys.executable, "-m", "demandops.cli.main", *words]
         with log.open("w") as sink:
-            return subprocess.Popen(
+            process = subprocess.Popen(
                 command, env=environment, stdout=sink, stderr=subprocess.STDOUT, text=True
             )
+        self._started.append(Served(process, state_repo, log, environment, self._domain))
+        return self._started[-1]
 
     def kill(self) -> None:
         for served in self._started:

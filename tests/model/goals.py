@@ -1,4 +1,4 @@
-"""Random requests in the form of the reference's action.
+"""Random requests of both actions.
 
 A maker draws its random numbers from a plain seed or from Hypothesis's ``randoms()``, which lets
 Hypothesis shrink a failed example. A maker uses few subjects, requesters and topics, so that
@@ -7,8 +7,9 @@ requests often concern the same ones.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import dataclass
 from random import Random
 from typing import Any, TypeVar
 
@@ -34,7 +35,6 @@ PARTIES = (*VEHICLES, STATION)
 
 SKELETON = World(nodes=frozenset({*PARTIES, "edge", "cloud"}), brokers=frozenset({"edge", "cloud"}))
 
-DEMANDS = ("d", "D/1", "again")
 REQUESTS = ("station00/collective-perception-intersection", "again", "")
 
 APPLICATIONS = {
@@ -59,6 +59,36 @@ CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
 }
 """Source, target, broker and topics of each connection."""
 
+
+def ego(vehicle: str) -> Topic:
+    return f"/vehicles/{vehicle}/ego_data", vehicle
+
+
+@dataclass(frozen=True)
+class Words:
+    """What demands of our own action are about; ``leases`` has None for a demand without one.
+
+    ``inputs`` are those of any application, with their roles. The last input, and the last topic
+    of a connection, is listed if no other is.
+    """
+
+    demands: tuple[str, ...]
+    applications: dict[str, str]
+    inputs: tuple[tuple[str, Topic], ...]
+    connections: dict[str, tuple[str, str, str, dict[str, str]]]
+    leases: tuple[int | None, ...] = (None,)
+
+
+OWN = Words(
+    demands=("d", "D/1", "again"),
+    applications={id: APPLICATIONS[id] for id in ("cloud/fusion", "edge/object_detection_fusion")},
+    inputs=(
+        *(("point_cloud", cloud) for cloud in CLOUDS),
+        *(("ego_data", ego(vehicle)) for vehicle in VEHICLES[:2]),
+    ),
+    connections={id: CONNECTIONS[id] for id in ("station00/edge", "vehicle00/edge")},
+)
+
 _JOINED_CONNECTION = {
     "broker_node_id": (12, ("", "cloud", "edge", "vehicle00")),
     "target_node_id": (24, ("cloud", "edge", "vehicle03", "nowhere")),
@@ -73,10 +103,6 @@ _LEFT_CONNECTION = {
 }
 
 
-def ego(vehicle: str) -> Topic:
-    return f"/vehicles/{vehicle}/ego_data", vehicle
-
-
 def shutdown_of(joined: Goal) -> Goal:
     return {**deepcopy(joined), "shutdown": True}
 
@@ -88,7 +114,7 @@ class Maker:
         """With ``both``, requests are in the form of our own action as well."""
         self._random = random
         self.calm, self.both = calm, both
-        self.puts: list[Goal] = []
+        self._demands = DemandMaker(random, OWN)
         self.joined: list[Goal] = []
         self.left: list[Goal] = []
 
@@ -97,7 +123,10 @@ class Maker:
 
     def any(self) -> Goal:
         if self.both and self._odds(4):
-            return self.own()
+            puts = self._demands.puts
+            if puts and self._odds(4):
+                return ended(self._pick(puts), "release")
+            return self._demands.any(self._random.randrange(DemandMaker.KINDS))
         if not self.joined or self._random.randrange(2) == 0:
             return self.join()
         if self._odds(6):
@@ -161,28 +190,6 @@ class Maker:
             more = self._pick(self.joined)
             made["apps"] += deepcopy(more["apps"])
             made["connections"] += deepcopy(more["connections"])
-        return made
-
-    def own(self) -> Goal:
-        """Return a put, renewal or release of a ``Demand``; some repeat a put, or are of others."""
-        if self.puts and self._odds(2):
-            made = self._pick(self.puts)
-            if self._odds(2):
-                return made
-            end = {name: made[name] for name in ("kind", "demand", "requesters")}
-            end["operation"] = self._pick(["release", "release", "renew"])
-            return end | ({"requesters": self._people()} if self._odds(4) else {})
-        people = self._people()
-        apps = [self._application(people) for _ in range(self._random.randrange(2))]
-        links = [self._connection(people)] if not apps or self._odds(2) else []
-        made = {
-            "kind": "Demand",
-            "demand": self._pick(DEMANDS),
-            "requesters": people,
-            "applications": [_own_application(app) for app in apps],
-            "connections": [_own_connection(link) for link in links],
-        }
-        self.puts.append(made)
         return made
 
     # Parts
@@ -300,28 +307,71 @@ class Maker:
         return self._random.randrange(against) == against - 1
 
 
-def _own_application(app: Item) -> Item:
-    body = app["object_detection_fusion_app"]
-    fields = {"ego_data": "ego_data_topics", "point_cloud": "pointcloud_topics"}
-    inputs = {
-        role: [{"topic": t["topic_name"], "source": t["source_node_id"]} for t in body[field]]
-        for role, field in fields.items()
-        if body[field]
-    }
-    place = {"id": app["header"]["id"], "node": app["header"]["node_id"], "connect": "none"}
-    return place | {"type": "object-detection-fusion", "inputs": inputs}
+class DemandMaker:
+    """Makes random demands of our own action about few subjects, so that they often overlap."""
+
+    PEOPLE = ("vehicle00", "vehicle01", "station00")
+    KINDS = 16
+
+    def __init__(self, random: Random, words: Words) -> None:
+        self._random, self._words = random, words
+        self.puts: list[Goal] = []
+
+    def any(self, kind: int) -> Goal:
+        """Return a known put or its renewal for the first kinds; else a put, renewal or release."""
+        if self.puts and kind < 9:
+            known = self._random.choice(self.puts[-2:])
+            if kind < 3:
+                return ended(known, "renew")
+            others = self._words.leases[1:]
+            return known | {"lease": self._random.choice(others)} if others and kind > 5 else known
+        if kind < 14:
+            self.puts.append(self.put())
+            return self.puts[-1]
+        return self._named("release" if kind == 14 else "renew")
+
+    def put(self) -> Goal:
+        made, words = self._named("put"), self._words
+        lease = self._random.choice(words.leases)
+        made |= {} if lease is None else {"lease": lease}
+        made["applications"] = [self._application(id) for id in self.some(words.applications)]
+        made["connections"] = [self._connection(id) for id in self.some(words.connections)]
+        return made
+
+    def _named(self, operation: str) -> Goal:
+        people = self.some(self.PEOPLE) or [self._random.choice(self.PEOPLE)]
+        demand = self._random.choice(self._words.demands)
+        made = {"kind": "Demand", "operation": operation, "demand": demand}
+        return made | {"requesters": people}
+
+    def some(self, of: Iterable[T]) -> list[T]:
+        return [one for one in of if self._random.randrange(2)]
+
+    def _application(self, id: str) -> Item:
+        *inputs, last = self._words.inputs
+        listed: dict[str, list[dict[str, str]]] = {}
+        for role, (topic, source) in self.some(inputs) or [last]:
+            listed.setdefault(role, []).append({"topic": topic, "source": source})
+        # mostly the same node, because otherwise most demands contradict each other
+        node = self._random.choice([*[self._words.applications[id]] * 3, "cloud"])
+        app = {"id": id, "type": "object-detection-fusion", "node": node, "connect": "none"}
+        return app | {"inputs": listed}
+
+    def _connection(self, id: str) -> Item:
+        source, target, broker, targets = self._words.connections[id]
+        *names, last = targets
+        chosen = {name: targets[name] for name in self.some(names) or [last]}
+        if not self._random.randrange(6):
+            chosen = {names[0] if names else last: "/elsewhere"}
+        source = "station00" if not self._random.randrange(6) else source
+        routes = [{"source": name, "target": to} for name, to in chosen.items()]
+        made = {"id": id, "source": source, "target": target, "topics": routes}
+        return made | ({"broker": broker} if broker else {})
 
 
-def _own_connection(item: Item) -> Item:
-    pairs = zip(item["source_topics"], item["target_topics"], strict=True)
-    made = {
-        "id": item["id"],
-        "type": "mqtt",
-        "source": item["source_node_id"],
-        "target": item["target_node_id"],
-        "topics": [{"source": source, "target": target} for source, target in pairs],
-    }
-    return made | ({"broker": item["broker_node_id"]} if item["broker_node_id"] else {})
+def ended(put: Goal, operation: str) -> Goal:
+    """Return the release or renewal of a demand by its requesters."""
+    return {name: put[name] for name in ("kind", "demand", "requesters")} | {"operation": operation}
 
 
 def summary(made: Goal) -> dict[str, Any]:

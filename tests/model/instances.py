@@ -10,8 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from tests.model.leases import Goal
-from tests.model.places import Outcome, Places
+from tests.model.books import Refused
+from tests.model.listed import Goal
+from tests.model.places import Places
 
 TALLY = "tally"
 """The type with separate instances, which need a replica per topic, and ``MOST`` at most."""
@@ -36,17 +37,14 @@ class Instances(Places):
 
     testing: str = NEXT
 
-    def take(self, goal: Goal, now: int, received: str = "") -> Outcome:
+    def _taken(self, goal: Goal, now: float, received: str) -> str:
         app: dict[str, Any] = next(iter(goal.get("applications", [])), {})
         if app.get("type") == TALLY:
-            chosen = self._chosen(app, goal["requesters"])
-            if chosen is None:
-                return "refused"
-            goal = goal | {"applications": [chosen]}
-        return super().take(goal, now, received)
+            goal = goal | {"applications": [self._chosen(app, goal["requesters"])]}
+        return super()._taken(goal, now, received)
 
-    def _chosen(self, app: dict[str, Any], who: list[str]) -> dict[str, Any] | None:
-        """Return ``app`` with the id, node and version for its claim; None to refuse the demand."""
+    def _chosen(self, app: dict[str, Any], who: list[str]) -> dict[str, Any]:
+        """Return ``app`` with the id, node and version for its claim."""
         asked = app["version"]
         version = self.testing if asked == "testing" else asked or DEFAULT
         asked = asked and version  # a claim records the version, not the channel
@@ -54,25 +52,26 @@ class Instances(Places):
         if version == NEXT:
             id = f"{id}@{NEXT}"
         elif app["id"] != id:
-            return None
+            raise Refused("the id is that of another version")
         node = HALL if app["node"] == FIRST else app["node"]
         if app["node"] == HALL:
             booked = {on for other, on in self.demanded() if other == id}
             allowed = {one for one in (HALL, FURTHER) if all(one in MAY[name] for name in who)}
             if len(choice := booked or allowed) != 1:
-                return None
+                raise Refused("the domain is not clear")
             (node,) = choice
         if any(node not in MAY[name] for name in who):
-            return None
+            raise Refused("it may not demand the node")
         return app | {"id": id, "node": node, "version": asked}
 
-    def demanded(self) -> dict[Instance, frozenset[Any]]:
-        found: dict[Instance, frozenset[Any]] = {}
-        for subjects in self.held.values():
-            for (_, id), held in subjects.items():
-                if held.what.get("type") == TALLY:
-                    one = id, held.what["node"]
-                    found[one] = found.get(one, frozenset()) | held.what["inputs"]["ego_data"]
+    def demanded(self) -> dict[Instance, frozenset[str]]:
+        """Return the topics that the demands for each instance list."""
+        found: dict[Instance, frozenset[str]] = {}
+        for id, claim in self.on("application"):
+            if claim.fixed["type"] == TALLY:
+                one = id, claim.fixed["node"]
+                topics = (topic for _, topic, _ in claim.topics)
+                found[one] = found.get(one, frozenset()).union(topics)
         return found
 
     def replicas(self, one: Instance) -> int:

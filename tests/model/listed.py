@@ -6,8 +6,7 @@ Like :mod:`.books`, it is written from docs/demand.md and imports nothing of the
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from dataclasses import field as field_of
+from dataclasses import dataclass, field
 from typing import Any
 
 Goal = dict[str, Any]
@@ -23,6 +22,8 @@ Route = tuple[str, str, str, str]
 """Source node, topic there, target node, topic there."""
 
 DETECTION_FUSION = 1
+FUSION = "object-detection-fusion"
+"""The type whose number in goals of the reference's action is ``DETECTION_FUSION``."""
 MQTT = 1
 _CONNECTION_TYPES = (0, 1, 2)
 _BODY = "object_detection_fusion_app"
@@ -39,14 +40,30 @@ class Claim:
     """``fixed`` has type and nodes; ``topics`` has the target of each topic of a connection.
 
     ``listed`` has the id that the demand lists for a topic of a connection, and None if no goal
-    lists the topic, but an application needs it.
+    lists the topic, but an application needs it. ``promised`` is when the last granted lease ends.
     """
 
     fixed: dict[str, Any]
     broker: str
     topics: dict[Topic, str]
     who: tuple[str, ...]
-    listed: dict[Topic, str | None] = field_of(default_factory=dict)
+    listed: dict[Topic, str | None] = field(default_factory=dict)
+    version: str = ""
+    lease: int | None = None
+    promised: float | None = field(default=None, compare=False)
+
+    def grant(self, lease: int | None, now: float, before: Claim | None) -> None:
+        self.lease = lease
+        self.promised = None if lease is None else now + lease
+        if self.promised and before and before.promised:
+            # a shorter lease does not take back what was promised before
+            self.promised = max(self.promised, before.promised)
+
+    def content(self) -> dict[str, Any]:
+        """Return all but the requesters and the lease."""
+        # all connections that are booked have this type
+        fixed = {name: what for name, what in self.fixed.items() if (name, what) != ("type", MQTT)}
+        return fixed | {"topics": dict(self.topics), "version": self.version}
 
     def contradicts(self, other: Claim) -> bool:
         # a connection keeps its type and broker, whatever is demanded
@@ -85,7 +102,7 @@ def items(goal: Goal, world: World) -> Iterator[tuple[Subject, Claim]]:
         yield from _own_items(goal)
         return
     for app in goal.get("apps", []):
-        fixed = {"type": app.get("type", 0), "node": app["header"].get("node_id", "")}
+        fixed = {"type": FUSION, "node": app["header"].get("node_id", "")}
         topics = dict.fromkeys(_inputs(app), "")
         who = tuple(sorted({*requesters(app)}))
         yield ("application", app["header"]["id"]), Claim(fixed, "", topics, who)
@@ -113,16 +130,23 @@ def _own_items(goal: Goal) -> Iterator[tuple[Subject, Claim]]:
             for role, topics in app["inputs"].items()
             for topic in topics
         }
-        fixed = {"type": DETECTION_FUSION, "node": app["node"]}
-        yield ("application", app["id"]), Claim(fixed, "", inputs, who)
+        fixed = {"type": app["type"], "node": app["node"]}
+        version = app.get("version", "")
+        yield ("application", app["id"]), Claim(fixed, "", inputs, who, version=version)
     for item in goal.get("connections", []):
         fixed = {"type": MQTT, "source": item["source"], "target": item["target"]}
-        routes = {(absolute(one["source"]),): absolute(one["target"]) for one in item["topics"]}
+        routes: dict[Topic, str] = {
+            (absolute(one["source"]),): absolute(one.get("target", one["source"]))
+            for one in item["topics"]
+        }
         yield ("connection", item["id"]), Claim(fixed, item.get("broker", ""), routes, who)
 
 
 def inadmissible(goal: Goal, world: World) -> Iterator[str]:
-    if goal.get("kind") == "Demand":  # those that the tests make have no such faults
+    if goal.get("kind") == "Demand":  # those that the tests make have no other faults
+        is_put = goal.get("operation", "put") == "put"
+        if is_put and not (goal.get("applications") or goal.get("connections")):
+            yield "nothing is listed"
         return
     joining = not goal.get("shutdown", False)
     listed = [*goal.get("apps", []), *goal.get("connections", [])]
@@ -180,8 +204,8 @@ def cannot_carry(claim: Claim, world: World) -> str:
 
 
 def _inputs(app: Item) -> Iterator[Topic]:
-    for role, field in (("ego_data", "ego_data_topics"), ("point_cloud", "pointcloud_topics")):
-        for topic in app.get(_BODY, {}).get(field, []):
+    for role, name in (("ego_data", "ego_data_topics"), ("point_cloud", "pointcloud_topics")):
+        for topic in app.get(_BODY, {}).get(name, []):
             yield role, absolute(topic["topic_name"]), topic.get("source_node_id", "")
 
 

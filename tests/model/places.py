@@ -9,14 +9,11 @@ nodes that it has chosen, and the model checks that they are free.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Any
 
-from tests.model import leases
-from tests.model.leases import Goal, Promises, Subject
-
-Outcome = Literal["booked", "released", "unchanged", "refused", "waiting", "waits"]
-"""``waiting``: a put adds or changes a waiting demand; ``waits``: a put repeats the demand."""
+from tests.model.books import Books, Key, Refused
+from tests.model.listed import Claim, Goal, Subject
 
 
 @dataclass(frozen=True)
@@ -31,7 +28,7 @@ class Waiting:
 
 
 @dataclass
-class Places(Promises):
+class Places(Books):
     """Adds demands that wait for room on ``nodes``; ``drained`` nodes get no applications."""
 
     nodes: frozenset[str] = frozenset()
@@ -40,50 +37,47 @@ class Places(Promises):
     chosen: Mapping[Subject, str] = field(default_factory=dict)
     """The node that the generator has chosen for each application, if known."""
 
-    def take(self, goal: Goal, now: int, received: str = "") -> Outcome:  # type: ignore[override]
+    def _taken(self, goal: Goal, now: float, received: str) -> str:
+        """Answer ``waiting`` if a put adds or changes what waits, ``waits`` if it repeats it."""
         demand, who = goal.get("demand", ""), frozenset(goal.get("requesters", ()))
         waits = self.waiting.get(demand)
         if waits and goal.get("operation", "put") != "put":
             if who != waits.who:
-                return "refused"
+                raise Refused("it is a demand of others")
             if goal["operation"] == "renew":
                 return "unchanged"
             del self.waiting[demand]
             return "released"
-        if not lacks_node(goal) or not who:
-            return super().take(goal, now)
-        standing = self.held.get(demand)
-        if standing is not None:
-            return self._put_again(goal, now, next(iter(standing.items())))
+        if not lacks_node(goal):
+            return super()._taken(goal, now, received)
+        for subject, claim in self.of(demand).items():
+            return self._put_again(goal, now, subject, claim)
         if waits and who != waits.who:
-            return "refused"
+            raise Refused("it is a demand of others")
         if self.free():
             first = min(self.waiting, key=self._turn, default=demand)
             # if the generator has chosen a node, no other demand may wait in front of this one
             assert first == demand or not self.chosen, f"{first} waits, but {demand} gets room"
             return self._place(demand, goal, now)
         if self.nodes <= self.drained:
-            return "refused"
+            raise Refused("all nodes are drained")
         since = waits.since if waits else received
         self.waiting[demand] = Waiting(goal.get("priority", 0), since, who, goal)
         return "waits" if self.waiting[demand] == waits else "waiting"
 
-    def _put_again(self, goal: Goal, now: int, held: tuple[Subject, leases.Held]) -> Outcome:
+    def _put_again(self, goal: Goal, now: float, subject: Subject, claim: Claim) -> str:
         """Apply a put to a demand that has a node, where it stays unless the node is drained."""
-        subject, what = held
-        node = what.what["node"]
-        if what.requesters != {*goal["requesters"]}:
-            return "refused"
-        if node in self.drained:
+        node: str = claim.fixed["node"]
+        if node in self.drained and claim.who == tuple(sorted({*goal["requesters"]})):
             if not self.free():
-                return "refused"
+                raise Refused("no node has room")
             node = self._chosen_node(subject)
-        return super().take(_at(goal, node), now)  # type: ignore[return-value]
+        return super()._taken(_at(goal, node), now, "")
 
-    def _place(self, demand: str, goal: Goal, now: int) -> Outcome:
+    def _place(self, demand: str, goal: Goal, now: float) -> str:
         self.waiting.pop(demand, None)
-        node = self._chosen_node(("applications", goal["applications"][0]["id"]))
-        return super().take(_at(goal, node), now)  # type: ignore[return-value]
+        node = self._chosen_node(("application", goal["applications"][0]["id"]))
+        return super()._taken(_at(goal, node), now, "")
 
     def _chosen_node(self, subject: Subject) -> str:
         node = self.chosen.get(subject) or min(self.free())
@@ -94,23 +88,20 @@ class Places(Promises):
         return self.waiting[demand].turn(demand)
 
     def free(self) -> frozenset[str]:
-        taken = {
-            held.what.get("node") for subjects in self.held.values() for held in subjects.values()
-        }
+        taken = {claim.fixed["node"] for _, claim in self.on("application")}
         return self.nodes - self.drained - taken
 
-    def book_waiting(self, demand: str, now: int) -> None:
+    def book_waiting(self, demand: str, now: float) -> None:
         """Book the demand that must be first in turn; ``now`` is the earliest time for it."""
         assert demand in self.waiting, f"{demand} is booked, and did not wait"
         first = min(self.waiting, key=self._turn)
         assert demand == first, f"{demand} is booked before {first}"
-        assert self._place(demand, self.waiting[demand].goal, now) == "booked"
+        self._place(demand, self.waiting[demand].goal, now)
 
-    def moved(self, demand: str, subject: Subject) -> None:
-        held = self.held[demand][subject]
-        assert held.what["node"] in self.drained, f"{subject} moved off a node that is not drained"
-        node = self._chosen_node(subject)
-        self.held[demand][subject] = replace(held, what=held.what | {"node": node})
+    def moved(self, key: Key) -> None:
+        fixed = self.claims[key].fixed
+        assert fixed["node"] in self.drained, f"{key} moved off a node that is not drained"
+        fixed["node"] = self._chosen_node(key[0])
 
     def drain(self, node: str, drained: bool) -> None:
         self.drained = self.drained | {node} if drained else self.drained - {node}

@@ -7,19 +7,15 @@ service, and each connection has a client at both ends.
 
 from __future__ import annotations
 
-import pickle
 from collections import Counter
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
+from tests.model.books import Refused
 from tests.model.instances import FURTHER, TALLY, Instances
-from tests.model.leases import Goal, Held, Subject
-from tests.model.places import Outcome
-
-FUSION = "object-detection-fusion"
+from tests.model.listed import FUSION, Goal
 
 Service = tuple[str, str]
 """An application's id, and its node."""
@@ -59,55 +55,39 @@ class Running(Instances):
 
     overrides: frozenset[Override] = frozenset()
 
-    def take(self, goal: Goal, now: int, received: str = "") -> Outcome:
+    def _taken(self, goal: Goal, now: float, received: str) -> str:
         """Refuse also what is new for a denied connection, or beyond ``CITY_QUOTA``."""
         denied = {one["id"] for one in goal.get("connections", ())} & self.denied()
-        tallies = any(one.get("type") == TALLY for one in goal.get("applications", ()))
-        if goal.get("shutdown") or not (denied or tallies):
-            return super().take(goal, now, received)
-        before = pickle.dumps(self.__dict__)
         had, counts = self._holds(denied), self._claims_in_city()
-        outcome = super().take(goal, now, received)
-        is_over = any(
-            count > max(CITY_QUOTA, counts[name]) for name, count in self._claims_in_city().items()
-        )
-        if is_over or (outcome == "booked" and self._holds(denied) != had):
-            self.__dict__.update(pickle.loads(before))  # noqa: S301 - bytes of this model
-            return "refused"
+        outcome = super()._taken(goal, now, received)
+        tallies = any(one.get("type") == TALLY for one in goal.get("applications", ()))
+        for name, count in self._claims_in_city().items() if tallies else ():
+            if count > max(CITY_QUOTA, counts[name]):
+                raise Refused("the quota of the domain is used up")
+        if outcome == "booked" and self._holds(denied) != had:
+            raise Refused("it is denied by an override")
         return outcome
 
-    def content(self, demand: str) -> dict[Subject, tuple[dict[str, Any], frozenset[str]]]:
-        held = self.held.get(demand, {})
-        return {subject: (deepcopy(one.what), one.requesters) for subject, one in held.items()}
-
     def _claims_in_city(self) -> Counter[str]:
-        here = (held for _, _, held in self._each("applications") if held.what["node"] == FURTHER)
-        return Counter(name for held in here for name in held.requesters)
+        here = (claim for _, claim in self.on("application") if claim.fixed["node"] == FURTHER)
+        return Counter(name for claim in here for name in claim.who)
 
     def denied(self) -> frozenset[str]:
         return frozenset().union(*(one.connections for one in self.overrides))
 
     def _holds(self, connections: set[str]) -> dict[Any, Any]:
         return {
-            (demand, subject): (dict(held.what), held.requesters)
-            for demand, subject, held in self._each("connections")
-            if subject in connections
+            key: (claim.content(), claim.who)
+            for key, claim in self.claims.items()
+            if key[0][0] == "connection" and key[0][1] in connections
         }
-
-    def _each(self, kind: str) -> list[tuple[str, str, Held]]:
-        return [
-            (demand, subject[1], held)
-            for demand, subjects in self.held.items()
-            for subject, held in subjects.items()
-            if subject[0] == kind
-        ]
 
     def services(self) -> dict[Service, tuple[list[str], int]]:
         topics: dict[Service, set[str]] = {}
-        for _, id, held in self._each("applications"):
-            if held.what["type"] == FUSION:
-                read = topics.setdefault((id, held.what["node"]), set())
-                read |= {topic for _, topic in held.what["inputs"]["ego_data"]}
+        for id, claim in self.on("application"):
+            if claim.fixed["type"] == FUSION:
+                read = topics.setdefault((id, claim.fixed["node"]), set())
+                read |= {topic for _, topic, _ in claim.topics}
         return {key: (sorted(read), self._replicas_on(key[1])) for key, read in topics.items()}
 
     def _replicas_on(self, node: str) -> int:
@@ -116,8 +96,9 @@ class Running(Instances):
 
     def links(self) -> dict[Link, dict[str, str]]:
         routes: dict[Link, dict[str, str]] = {}
-        for _, id, held in self._each("connections"):
+        for id, claim in self.on("connection"):
             if id not in self.denied():
-                link = id, held.what["source"], held.what["target"]
-                routes.setdefault(link, {}).update(held.what["topics"])
+                link = id, claim.fixed["source"], claim.fixed["target"]
+                carried = {topic: target for (topic,), target in claim.topics.items()}
+                routes.setdefault(link, {}).update(carried)
         return routes

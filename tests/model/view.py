@@ -2,12 +2,47 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from demandops.model.demand.demand import Application
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import demand_id
+
+from tests.model import books as model
 from tests.model.books import Books
-from tests.model.listed import Claim
+from tests.model.listed import Subject
+
+Key = tuple[Subject, str]
+"""A claim's key: its subject and the id of its demand in the ledger."""
+Content = tuple[dict[str, Any], tuple[str, ...]]
+"""What a claim holds, and its requesters."""
+
+
+def key_of(key: model.Key) -> Key:
+    subject, (id, who) = key
+    return subject, demand_id(id, who) if who else id
+
+
+def claims_of(books: Books) -> dict[Key, Content]:
+    return {key_of(key): (claim.content(), claim.who) for key, claim in books.claims.items()}
+
+
+def key_in_ledger(key: claim_files.ClaimKey) -> Key:
+    return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
+
+
+def claims_in_ledger(ledger: Iterable[claim_files.Claim]) -> dict[Key, Content]:
+    return {key_in_ledger(claim.key): (_content(claim), claim.requesters) for claim in ledger}
+
+
+def _content(claim: claim_files.Claim) -> dict[str, Any]:
+    held = claim.held
+    if isinstance(held, Application):
+        fixed = {"type": held.appdef, "node": held.node, "version": held.version}
+        return fixed | {"topics": dict.fromkeys(held.topic_keys(), "")}
+    routes = {(route.source,): route.target for route in held.topics}
+    return {"source": held.source, "target": held.target, "topics": routes, "version": ""}
 
 
 def view(books: Books) -> dict[str, Any]:
@@ -27,7 +62,7 @@ def _services(books: Books) -> dict[tuple[str, str, str], dict[str, Any]]:
         entry["requesters"] |= {*who}
         entry["inputs"].setdefault(role, {}).setdefault(topic, set()).update(who)
 
-    for id, claim in _on("application", books):
+    for id, claim in books.on("application"):
         node, who = claim.fixed["node"], claim.who
         for role, topic, source in claim.topics:
             if role == "ego_data":
@@ -36,22 +71,28 @@ def _services(books: Books) -> dict[tuple[str, str, str], dict[str, Any]]:
             cloud = f"{source} {topic}"
             read(("object-fusion", node, id), id, "object_list", cloud, who)
             read(("object-detection", node, cloud), id, "point_cloud", topic, who)
-    return _sorted(found)  # type: ignore[no-any-return]
+    return {key: _without_names(entry) for key, entry in _sorted(found).items()}
+
+
+def _without_names(entry: dict[str, Any]) -> dict[str, Any]:
+    """Return an entry of a service with only the requesters of each object list.
+
+    The docs do not promise the lists' names, which test_flows compares at both ends.
+    """
+    inputs = entry["inputs"]
+    lists = {role: sorted(inputs[role].values()) for role in inputs if role == "object_list"}
+    return entry | {"inputs": inputs | lists}
 
 
 def _connections(books: Books) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
-    for id, claim in _on("connection", books):
+    for id, claim in books.on("connection"):
         ends = {end: claim.fixed[end] for end in ("source", "target")}
         entry = found.setdefault(id, {**ends, "topics": {}, "requesters": set()})
         entry["requesters"] |= {*claim.who}
         for (topic,) in claim.topics:
             entry["topics"].setdefault(topic, set()).update(claim.who)
     return _sorted(found)  # type: ignore[no-any-return]
-
-
-def _on(kind: str, books: Books) -> Iterator[tuple[str, Claim]]:
-    return ((id, claim) for ((of, id), _), claim in books.claims.items() if of == kind)
 
 
 def _sorted(value: Any) -> Any:
@@ -61,9 +102,7 @@ def _sorted(value: Any) -> Any:
     return sorted(value) if isinstance(value, set) else value
 
 
-def in_model_words(
-    data: Mapping[str, Any], object_lists: Mapping[tuple[str, str], str]
-) -> dict[str, Any]:
+def in_model_words(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the program's bookkeeping as :func:`view` gives it."""
     services = {}
     for entry in data["services"].values():
@@ -77,37 +116,10 @@ def in_model_words(
         for topics in entry["inputs"].values():
             assert list(topics) == sorted(topics), topics
         inputs = {role: topics for role, topics in entry["inputs"].items() if topics}
-        if "object_list" in inputs:
-            inputs["object_list"] = {
-                object_lists.get((node, topic), f"published by nobody: {topic}"): who
-                for topic, who in inputs["object_list"].items()
-            }
-        services[key] = {name: entry[name] for name in ("applications", "requesters")} | {
-            "inputs": inputs
-        }
-    told = ("source", "target", "topics", "requesters")
+        told = {name: entry[name] for name in ("applications", "requesters")}
+        services[key] = _without_names(told | {"inputs": inputs})
+    compared = ("source", "target", "topics", "requesters")
     connections = {
-        id: {name: entry[name] for name in told} for id, entry in data["connections"].items()
+        id: {name: entry[name] for name in compared} for id, entry in data["connections"].items()
     }
     return {"services": services, "connections": connections}
-
-
-def object_lists(manifests: Iterable[str]) -> dict[tuple[str, str], str]:
-    """Map (node, topic of an object list) to the point cloud that releases make it from."""
-    found: dict[tuple[str, str], str] = {}
-    for text in manifests:
-        published = re.search(r"objectListTopic: (\S+)", text)
-        if not published:
-            continue
-        node, source, topic = (
-            _only(rf'demandops/{name}: "(.*)"', text) for name in ("node", "source", "source-topic")
-        )
-        assert topic == _only("pointCloudTopic: (.*)", text)
-        assert (node, published[1]) not in found, f"two detections on {node}: {published[1]}"
-        found[node, published[1]] = f"{source} {topic}"
-    return found
-
-
-def _only(pattern: str, text: str) -> str:
-    (found,) = set(re.findall(pattern, text))
-    return str(found)

@@ -13,7 +13,6 @@ from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, init, tip
 from tests.kit.rig import wait_until
 from tests.kit.ros import Client, Serve, Served, Servers, reserved
-from tests.kit.warm_commands import WarmCommands
 from tests.scenarios import running
 
 
@@ -24,19 +23,10 @@ def ros_domain() -> Iterator[int]:
         yield domain
 
 
-@pytest.fixture(scope="session")
-def warm(tmp_path_factory: pytest.TempPathFactory) -> Iterator[WarmCommands]:
-    made = WarmCommands(tmp_path_factory.mktemp("warm"))
-    yield made
-    made.close()
-
-
 @pytest.fixture
-def servers(
-    tmp_path: Path, data_home: Path, ros_domain: int, warm: WarmCommands
-) -> Iterator[Servers]:
+def servers(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Servers]:
     """Starts commands that use ROS; commands that still run at the end of the test are killed."""
-    made = Servers(tmp_path, ros_domain, warm)
+    made = Servers(tmp_path, ros_domain)
     yield made
     made.kill()
 

@@ -23,6 +23,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
+from tests.kit.goals import EXPERIMENT
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import git, tip
 from tests.kit.rig import wait_until
@@ -228,3 +229,20 @@ def test_the_command_line_sends_holds_and_gives_up(
     assert holding.returncode == 0, err
     assert "'typed' booked in " in out and "held until Ctrl-C\nreleased\n" in err
     assert operations(shared, before) == [*held, "release"]
+
+
+def test_the_command_line_sends_goals_of_the_reference(
+    shared: Served, before: str, demandops: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(shared.domain))
+    joins = EXPERIMENT[0]
+    sent = demandops("demand", joins, "--via", "ros", "--output", "json")
+    (row,) = sent.json()
+    assert (row["outcome"], row["commit"]) == ("booked", tip(Path(shared.state_repo))), sent.err
+    gone = demandops("demand", joins, "--via", "ros", "--release")
+    assert "released in " in gone.out, gone.err
+    assert operations(shared, before) == ["join", "shutdown"]
+    again = demandops("demand", joins, "--via", "ros", "--release", "--output", "json")
+    assert [each["code"] for each in again.json()[0]["faults"]] == ["not-held"]
+    held = demandops("demand", joins, "--via", "ros", "--hold")
+    assert (held.code, "--hold is for documents of the kind Demand" in held.err) == (2, True)

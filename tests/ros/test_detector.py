@@ -5,7 +5,7 @@ The experiment in full (`examples/experiment/full`) drives the paper's vehicles 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -34,17 +34,6 @@ def rules_of(**fields: Any) -> str:
     rule = {"name": "near", "near": near, "demand": demand, "retry": "1s"}
     sources = {"vehicles": {"topic": "/vehicles/{entity}/pose", "type": POSE}}
     return text_of(rule | fields, sources=sources)
-
-
-@pytest.fixture
-def servers(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Servers]:
-    """A starter that runs each command in a new process, as a person does.
-
-    A forked detector could start before the node publishes the newest bookkeeping.
-    """
-    started = Servers(tmp_path, ros_domain)
-    yield started
-    started.kill()
 
 
 def test_who_comes_near_demands_until_it_leaves_and_rules_are_reloaded(

@@ -218,7 +218,7 @@ def test_a_goal_can_be_cancelled_until_it_is_committed_and_a_stopped_node_finish
 
 
 def test_bookkeeping_is_answered_over_ros_by_one_thread(shared: Served, caller: Client) -> None:
-    first = caller.call(connection(1003)).message.removeprefix("booked: ")
+    first = caller.call(connection(1003)).commit
     caller.call(connection(1004))
     service = caller.node.create_client(GetBookkeeping, "/demandops/get_bookkeeping")
     caller.wait(service.service_is_ready)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,9 +13,13 @@ from pathlib import Path
 
 import pytest
 from demandops.base.errors import InvalidInput
-from demandops_ros.parameter_sync import parameters_of
+from demandops_ros.parameter_sync import as_the_node_has_it, parameters_of
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.node import Node
 from rclpy.parameter import Parameter
+from std_msgs.msg import String
 
+from tests.kit.cli import Run
 from tests.kit.cluster import KubeApi, kube_api
 from tests.kit.http import kubeconfig
 from tests.kit.limits import PATIENCE_S
@@ -66,8 +71,9 @@ def start_fusion(tmp_path: Path, ros_domain: int) -> Iterator[StartFusion]:
         yield start
 
 
-def start_sync(servers: Servers, folder: Path) -> Served:
-    given = {"configmap_name": "of-params", "namespace": "perception", "target_ros_node": TARGET}
+def start_sync(servers: Servers, folder: Path, *targets: str) -> Served:
+    given = {"configmap_name": "of-params", "namespace": "perception"}
+    given |= {"target_ros_node": ",".join(targets or [TARGET]), "state_file": f"{folder}/state"}
     parameters = [part for name, value in given.items() for part in ("-p", f"{name}:={value}")]
     config = str(folder / "kubeconfig")
     options = ["parameter-sync", "--kubeconfig", config, "--ros-args", *parameters]
@@ -108,6 +114,101 @@ def test_a_node_follows_without_a_restart_and_after_one(
     start_fusion()
     client.wait(lambda: log.read_text().count(DONE) > times)
     assert sync.stop(signal.SIGTERM) == 0, log.read_text()
+
+
+def test_the_example_of_the_scaffold_follows_all_at_once_or_not_at_all(
+    cluster: KubeApi,
+    demandops: Run,
+    servers: Servers,
+    client: Client,
+    ros_domain: int,
+    tmp_path: Path,
+) -> None:
+    """Its node passes on what it reads, and keeps its process and its other subscriptions."""
+    options = "--input wave=std_msgs/msg/String --image x.example/y:1 --service my-echo=echo/echo"
+    repo = tmp_path / "fleet"
+    assert demandops("init", repo).code == 0
+    assert demandops("new", "application", "echo", *options.split(), "-C", repo).code == 0
+    environment = os.environ | {"ROS_DOMAIN_ID": str(ros_domain)}
+    renamed = ["--ros-args", "-r", f"__node:={TARGET}"]
+    program = [sys.executable, f"{repo}/appdefs/echo/nodes/my-echo.py", *renamed]
+    heard = list[str]()
+    client.node.create_subscription(String, "/result", lambda text: heard.append(text.data), 10)
+    writers = {name: client.node.create_publisher(String, name, 10) for name in ("/a", "/b")}
+
+    def is_passed_on(*topics: str) -> bool:
+        for name, writer in writers.items():
+            writer.publish(String(data=name))
+        client.executor.spin_once(timeout_sec=0.05)
+        arrived = {*heard[-4:]} == {*topics}
+        return arrived and read_by_the_fusion(client) == {*topics}
+
+    def want(topics: list[str], **more: object) -> None:
+        parameters = {"wave_topics": topics, "result_topic": "/result", **more}
+        hold(cluster, text=json.dumps({TARGET: {"ros__parameters": parameters}}))
+
+    with subprocess.Popen(program, env=environment) as node:
+        try:
+            want(["/a"])
+            sync = start_sync(servers, tmp_path)
+            client.wait(lambda: is_passed_on("/a"))
+            want(["/a", "/b"])
+            client.wait(lambda: is_passed_on("/a", "/b"))
+            # nothing of a change that the node refuses, and its reason where a probe shows it
+            want(["/b", "two words"], result_topic="/elsewhere")
+            state = tmp_path / "state"
+            client.wait(lambda: "refused its parameters: wave_topics: " in state.read_text())
+            assert "'two words'" in state.read_text()
+            assert state.read_text() in sync.log.read_text()
+            client.wait(lambda: is_passed_on("/a", "/b"))
+            want([""])
+            client.wait(lambda: state.read_text() == "set\n")
+            assert read_by_the_fusion(client) == set()
+            assert node.poll() is None
+        finally:
+            node.kill()
+
+
+def test_several_nodes_get_the_types_that_they_have_and_are_asked_again(
+    cluster: KubeApi, servers: Servers, client: Client, tmp_path: Path
+) -> None:
+    nodes = [Node(name, context=client.node.context) for name in ("first", "second")]
+    for node in nodes:
+        client.executor.add_node(node)
+        node.declare_parameter("rate", 0.5)
+        node.declare_parameter("ids", [1])
+    is_ready = False
+    nodes[1].add_on_set_parameters_callback(
+        lambda changes: SetParametersResult(successful=is_ready, reason="not yet")
+    )
+    section = {"ros__parameters": {"rate": 10, "ids": [""]}}
+    hold(cluster, text=json.dumps({"first": section, "second": section}))
+    sync, state = start_sync(servers, tmp_path, "first", "second"), tmp_path / "state"
+    client.wait(lambda: nodes[0].get_parameter("rate").value == 10.0)
+    assert list(nodes[0].get_parameter("ids").value) == []
+    client.wait(lambda: state.read_text() == "/second refused its parameters: not yet")
+    is_ready = True
+    client.wait(lambda: state.read_text() == "set\n")
+    assert nodes[1].get_parameter("rate").value == 10.0
+    assert sync.log.read_text().count("not yet") == 1
+    for node in nodes:
+        node.destroy_node()
+
+
+def test_a_value_gets_the_type_of_the_node() -> None:
+    kinds = Parameter.Type
+    for value, kind, expected in (
+        (3, kinds.DOUBLE, kinds.DOUBLE),
+        (True, kinds.DOUBLE, kinds.BOOL),  # which the node refuses
+        ([1, 2], kinds.DOUBLE_ARRAY, kinds.DOUBLE_ARRAY),
+        ([1, 2.5], kinds.NOT_SET, kinds.DOUBLE_ARRAY),
+        ([1, 2], kinds.NOT_SET, kinds.INTEGER_ARRAY),
+        ([], kinds.STRING_ARRAY, kinds.STRING_ARRAY),
+        ([""], kinds.BOOL_ARRAY, kinds.BOOL_ARRAY),
+        ([""], kinds.STRING, kinds.STRING_ARRAY),
+    ):
+        assert as_the_node_has_it("x", value, kind).type_ is expected, (value, kind)
+    assert as_the_node_has_it("x", [""], kinds.STRING_ARRAY).value == [""]
 
 
 def test_parameters_have_dotted_names_and_a_file_that_gives_a_node_nothing_is_refused() -> None:

@@ -18,7 +18,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tests.kit.cli import Run
-from tests.kit.detection import POSE, write_bag
+from tests.kit.detection import POSE, SOURCES, rule, text_of, write_bag
 from tests.kit.goals import EXPERIMENT
 
 RULES = Path(__file__).parents[2] / "examples" / "experiment" / "rules.yaml"
@@ -127,6 +127,29 @@ def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
     lacks, _, has = fault["message"].partition("; it has ")
     assert lacks.endswith(f"no topic that the rules read: /cars/{{entity}}/pose ({POSE})")
     assert has.startswith("/vehicles/tram/pose (std_msgs/msg/String), ")
+
+
+def test_a_rule_without_an_event_is_told_with_what_was_seen(demandops: Run, tmp_path: Path) -> None:
+    record(tmp_path / "bag")
+    point = dict(zip("xy", STATION, strict=True))
+    far = {"source": "cars", "point": point | {"x": 3000.0}, "start": 5, "stop": 6}
+    rules = {
+        "named": {"near": far, "entities": ["car*"]},
+        "far": {"near": far},
+        "many": {"count": {"source": "cars", "point": point, "radius": 9, "start": 9, "stop": 0}},
+        "close": {"together": {"source": "cars", "start": 0.1, "stop": 0.2}, "dwell": "1h"},
+    }
+    sources = {"cars": SOURCES["cars"] | {"topic": "/vehicles/{entity}/pose"}}
+    file = tmp_path / "rules.yaml"
+    file.write_text(text_of(*(rule(name, **rules[name]) for name in rules), sources=sources))
+    ran = demandops("detect", file, "--replay", tmp_path / "bag")
+    seen = "entities seen: vehicle00, vehicle01, vehicle03"
+    assert [line for line in ran.out.splitlines() if "had no event" in line] == [
+        f"rule 'named' had no event: {seen}; none matches car*",
+        "rule 'far' had no event: nearest: vehicle01 at 8,234 m (start: 5, dwell: 0s)",
+        "rule 'many' had no event: nearest: vehicle01 at 80 m (start: 9, dwell: 0s)",
+        f"rule 'close' had no event: {seen}; its condition never held for 1h",
+    ]
 
 
 def test_a_damaged_end_of_a_bag_is_told_without_a_count(capfd: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import yaml
 from demandops.base.errors import Fault, Refused
-from demandops.decide.booking import Drain
+from demandops.decide.booking import Drain, Restoration
 from demandops.decide.checks.forbidden import whole_usage
 from demandops.decide.decision import Decision, decide
 from demandops.decide.edits import changed_claim_files
@@ -56,7 +56,7 @@ class ExpectedFault(FrozenModel):
 
 _CHECKS = (
     "gives", "refused", "expires", "runs", "connections", "carries", "desired", "leases", "holds",
-    "warns", "waiting", "asks", "places",
+    "warns", "waiting", "asks", "places", "nodes", "effects",
 )  # fmt: skip
 
 
@@ -66,6 +66,7 @@ class Step(FrozenModel):
     ``config`` changes files as a person does, ``clock`` sets only the wall clock, ``restart``
     discards the generator's memory, and ``expires`` lists the demands that it then releases, in
     order. ``asks`` is who must approve the demand, and ``places`` why it got its nodes.
+    ``back_to`` rolls back to the claims after a step, by its number.
     """
 
     why: str = ""
@@ -74,7 +75,9 @@ class Step(FrozenModel):
     restart: bool = False
     config: dict[str, dict[str, Any]] = Field(default_factory=dict)
     send: dict[str, Any] | None = None
-    gives: Literal["booked", "released", "unchanged", "waiting"] | None = None
+    back_to: int | None = None
+    drop_newer: bool = False
+    gives: Literal["booked", "released", "unchanged", "waiting", "restored"] | None = None
     waiting: list[str] | None = None
     refused: list[ExpectedFault] | None = None
     warns: list[str] | None = None
@@ -87,6 +90,8 @@ class Step(FrozenModel):
     desired: list[str] | None = None
     leases: dict[str, str] | None = None
     holds: dict[str, list[str]] | None = None
+    nodes: dict[str, dict[str, str]] | None = None
+    effects: dict[str, str] | None = None
 
     @model_validator(mode="after")
     def _checkable(self) -> Step:
@@ -96,12 +101,16 @@ class Step(FrozenModel):
             raise ValueError("refused is empty; list the faults that the refusal must have")
         if self.holds is not None and not (self.holds and all(self.holds.values())):
             raise ValueError("holds is empty, or lists no words for a release")
-        if self.send is not None and (self.gives is None) == (self.refused is None):
-            raise ValueError("a step with send needs either gives or refused")
+        if self.sends and (self.gives is None) == (self.refused is None):
+            raise ValueError("a step with send or back_to needs either gives or refused")
         of_demand = (self.gives, self.refused, self.desired, self.warns, self.asks, self.places)
-        if self.send is None and any(of_demand):
+        if not self.sends and any((*of_demand, self.effects)):
             raise ValueError("the effects of a demand need a demand; add send")
         return self
+
+    @property
+    def sends(self) -> bool:
+        return self.send is not None or self.back_to is not None
 
 
 class Scenario(FrozenModel):
@@ -164,6 +173,7 @@ class World(MemoryRepo):
         super().__init__(state=state)
         self.clock = Clock(START)
         self.configure(state, config)
+        self.ledgers = [state.ledger]  # after each step
         self._sent = 0
         self.restart()
 
@@ -229,6 +239,13 @@ class World(MemoryRepo):
     def connections(self, what: str) -> dict[str, list[str]]:
         return {id: [*entry[what]] for id, entry in self.books()["connections"].items()}
 
+    def nodes(self) -> dict[str, dict[str, str]]:
+        """Return what is requested of each node that has a capacity, such as `1 of 3`."""
+        return {
+            id: {name: f"{one['requested']} of {one['capacity']}" for name, one in entry.items()}
+            for id, entry in self.bookkeeping().get("nodes", {}).items()
+        }
+
     def leases(self) -> dict[str, datetime]:
         """Return, for each demand, the latest of its leases' recorded ends."""
         leased = sorted(
@@ -270,6 +287,7 @@ def run(scenario: Scenario) -> None:
             world.assert_sound()
         except AssertionError as error:
             raise AssertionError(f"{place}: {error}") from error
+        world.ledgers.append(world.state.ledger)
 
 
 def _take(step: Step, world: World, place: str) -> None:
@@ -281,14 +299,19 @@ def _take(step: Step, world: World, place: str) -> None:
         world.restart()
     ended = world.do_what_is_due()
     assert ended == (step.expires or []), f"{place}: other demands expire than expected"
-    if step.send is not None:
-        taken = world.take(step.send)
+    if step.sends:
+        goal: object = step.send
+        if step.back_to is not None:
+            then = tuple(world.ledgers[step.back_to])
+            goal = Restoration(id="back", to="0" * 40, claims=then, drop_newer=step.drop_newer)
+        taken = world.take(goal)
         for problem in _sent(step, taken):
             raise AssertionError(f"{place}: {problem}")
         if isinstance(taken, Decision) and taken.awaited:
             world.book_waiting()
     compared = {
         "runs": world.runs,
+        "nodes": world.nodes,
         "waiting": world.waiting,
         "connections": lambda: world.connections("requesters"),
         "carries": lambda: world.connections("topics"),
@@ -322,6 +345,10 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
     desired = sorted(f"{signs[release.change]} {release.what}" for release in taken.releases)
     if step.desired is not None and desired != sorted(step.desired):
         yield f"the desired state changes in another way: {desired}"
+    effects = {one.name: one.effect for one in taken.releases}
+    for name, effect in (step.effects or {}).items():
+        if {each for known, each in effects.items() if known.startswith(name)} != {effect}:
+            yield f"has other effects: {effects}"
     if step.asks not in (None, [*taken.approval]):
         yield f"needs the approval of {taken.approval}"
     for name, texts in (("warns", taken.warnings), ("places", taken.placed)):

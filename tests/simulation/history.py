@@ -17,11 +17,13 @@ from demandops.serve.agenda import LONGEST_WAIT_S
 
 from tests.kit import plain_yaml, repo
 from tests.kit.config import texts_below
+from tests.kit.goals import connection, goal
 from tests.kit.repo import GitRepo
+from tests.model.goals import DemandMaker, Words
 from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
-from tests.model.leases import Goal
+from tests.model.listed import Goal
+from tests.model.view import key_in_ledger
 from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
-from tests.simulation.promises import Maker, name_of
 from tests.simulation.world import World
 
 STEPS = 30
@@ -36,6 +38,17 @@ _OVERRIDES: dict[str, dict[str, object]] = {
     "closed": {"select": [{"connections": ["x"]}], "deny": True},
 }
 _LONGEST_LEASE_S = 90
+WORDS = Words(
+    demands=("d0", "d1", "D1", "d/2"),
+    applications={"a": "edge", "b": "edge"},
+    inputs=tuple(("ego_data", (f"/ego{number}", "vehicle00")) for number in (1, 2, 3)),
+    # no other connection has its topics, so the model needs not know which one carries a topic
+    connections={
+        id: ("vehicle00", "edge", "", {f"/{id}{name}": f"/{id}{name}" for name in "pqr"})
+        for id in "xy"
+    },
+    leases=(None, 10, 60, _LONGEST_LEASE_S),
+)
 
 
 @lru_cache(maxsize=1)
@@ -55,7 +68,8 @@ class History:
     def __init__(self, world: World) -> None:
         self.world, self.oracle = world, Oracle(world)
         self.chance, self.turns = world.turns.chance, world.turns
-        self._maker = Maker(self.chance)
+        self._maker = DemandMaker(self.chance, WORDS)
+        self._shutdowns: list[Goal] = []
         self._latest = 0.0
         self._sent: list[Goal] = []
         self._often, self._edited_often = self.chance.choice(
@@ -64,8 +78,8 @@ class History:
                 (self._tallied, self._move_channel),
                 (self._placed, self._drain),
                 (self._visitor, self._edit_generated),
-                (self._maker.any, self._delete_claim),
-                (self._maker.any, self._override),
+                (self._any, self._delete_claim),
+                (self._any, self._override),
                 (self._message, self._delete_claim),
             ]
         )
@@ -122,9 +136,9 @@ class History:
         """Send demands to one machine; they become one batch if its generator is busy meanwhile."""
         ready = [machine for machine in self.world.machines if machine.generator]
         machine = self.chance.choice(ready) if ready else None
-        for goal in goals if machine else ():
-            self._sent.append(goal)
-            self.oracle.ask(machine, goal)
+        for one in goals if machine else ():
+            self._sent.append(one)
+            self.oracle.ask(machine, one)
 
     def _goal(self) -> Goal:
         kind = self.chance.randrange(18)
@@ -140,11 +154,30 @@ class History:
             return self._message()
         if kind < 5:
             return self._placed()
-        return self._maker.any()
+        return self._any()
+
+    def _any(self) -> Goal:
+        kind = self.chance.randrange(20)
+        if kind < DemandMaker.KINDS:
+            return self._maker.any(kind)
+        if kind == 19 and self._shutdowns:
+            return self.chance.choice(self._shutdowns[-2:])
+        return self._of_the_reference(shutdown=kind > 17)
+
+    def _of_the_reference(self, *, shutdown: bool) -> Goal:
+        """Return a goal of the reference's action for one connection."""
+        id, people = self.chance.choice("xy"), DemandMaker.PEOPLE
+        topics = [f"/{id}{name}" for name in self._maker.some("pq")]
+        topics = topics if shutdown else topics or [f"/{id}p"]
+        who = self._maker.some(people) or people[:1]
+        item = connection(id, who=who, topics=topics, broker="")
+        made = goal([], [item], id=self.chance.choice(["m0", "m1"]), shutdown=shutdown)
+        self._shutdowns += [made] * shutdown
+        return made
 
     def _message(self) -> Goal:
         """Return a goal of the reference's action, mostly for whom an earlier one joined."""
-        made = self._maker._message(shutdown=bool(self.chance.randrange(2)))
+        made = self._of_the_reference(shutdown=bool(self.chance.randrange(2)))
         joins = [one for one in self._sent[-12:] if one.get("shutdown") is False]
         if joins and self.chance.randrange(3):
             (item,), known = made["connections"], self.chance.choice(joins)
@@ -322,9 +355,8 @@ class History:
         found = sorted(self.oracle.claims().items())
         if found:
             path, claim = self.chance.choice(found)
-            demand, subject = name_of(claim)
-            commit = self._commit({path: None})
-            self.oracle.edits[commit] = lambda books: books._drop(demand, subject)
+            gone = self.oracle.key_of(key_in_ledger(claim.key))
+            self.oracle.edits[self._commit({path: None})] = lambda books: books.drop([gone])
 
     def _edit_generated(self) -> None:
         found = sorted(path for path in self._files("clusters/") if path.endswith(".yaml"))

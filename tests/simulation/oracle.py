@@ -23,10 +23,11 @@ from demandops.repo.history.commit_message import PROPOSAL
 from demandops.serve.journal import Ticket
 
 from tests.kit import plain_yaml
+from tests.model import books, view
+from tests.model.goals import SKELETON
 from tests.model.instances import FURTHER, NEXT
-from tests.model.leases import Goal, Subject
+from tests.model.listed import Goal, Subject
 from tests.model.running import Link, Override, Running, Service
-from tests.simulation.promises import claims_of, name_of
 from tests.simulation.world import Machine, World
 
 SLACK_S = 30
@@ -84,7 +85,7 @@ class Oracle:
         self.decided: set[str] = set()
         self.counts = Counter[str]()
         self._seen = world.tip
-        self.books = Running(SLACK_S, nodes=PLACES)
+        self.books = Running(SKELETON, nodes=PLACES)
         self._ended: set[Override] = set()
         self._pushed_at = world.turns.monotonic()
         """When the oracle last found a new tip of main."""
@@ -94,7 +95,7 @@ class Oracle:
         self._commit: dict[str, str] = {}
         self._parsed: dict[pygit2.Oid, Claim] = {}
         self._last: dict[Any, int] = {}
-        self._claims: dict[Any, Any] = {}
+        self._claims: dict[view.Key, view.Content] = {}
         world.on_start = self._check_resumed
         world.on_push = lambda: self._guard(self._follow_main)
 
@@ -152,9 +153,9 @@ class Oracle:
 
     def _book(self, commit: pygit2.Commit, by: tuple[Machine, float, float] | None) -> None:
         self.counts["commits"] += 1
-        claims = claims_of(self.claims(str(commit.id)).values())
+        claims = view.claims_in_ledger(self.claims(str(commit.id)).values())
         self.books.chosen = {
-            subject: what["node"] for (_, subject), (what, _) in claims.items() if "node" in what
+            subject: what["node"] for (subject, _), (what, _) in claims.items() if "node" in what
         }
         if str(commit.id) in self.edits:
             self.edits[str(commit.id)](self.books)
@@ -171,18 +172,18 @@ class Oracle:
                 assert not asked.is_withdrawn, f"{operation} is booked, but was withdrawn"
                 self._assert_in_order(asked)
             time = self.world.turns.monotonic() if branch else asked.time
-            held = self.books.content(asked.goal.get("demand", ""))
+            held = self._content(asked)
             outcome = self._take(self.books, asked, time)
             assert outcome != "refused", f"{operation} is booked, but the model refuses it"
             # a shorter demand and other leases need no approval
-            now = self.books.content(asked.goal.get("demand", ""))
+            now = self._content(asked)
             adds = any(held.get(subject) != what for subject, what in now.items())
             is_approved = branch in self.approved or not (asked.needs_approval and adds)
             assert is_approved, f"{operation} is booked, but nobody approved it"
             renews = any(one.lease for one in self.claims(str(commit.id)).values())
             assert outcome != "unchanged" or renews, f"{operation} is booked, but changes nothing"
             self.counts["waited"] += outcome == "waiting"
-        _assert_same(commit, claims, self.books.claims())
+        _assert_same(commit, claims, view.claims_of(self.books))
         _assert_same(commit, self._waiting_on(commit), self.books.waiting_files())
         if entry_of(commit).by_generator:
             self._compare_replicas(commit)
@@ -198,7 +199,7 @@ class Oracle:
             (
                 "city" if one[1] == FURTHER else "perception",
                 one[0].partition("@")[2],
-                sorted(topic for _, topic in topics),
+                sorted(topics),
                 self.books.replicas(one),
             )
             for one, topics in self.books.demanded().items()
@@ -216,9 +217,17 @@ class Oracle:
         self._ended = {one for one in overrides if one.name in ended}
         self.books.overrides = frozenset(overrides) - self._ended
 
+    def _content(self, asked: Asked) -> dict[Subject, dict[str, Any]]:
+        held = self.books.of(asked.goal.get("demand", ""))
+        return {subject: claim.content() for subject, claim in held.items()}
+
+    def key_of(self, key: view.Key) -> books.Key:
+        """Return the model's key of a claim of the ledger."""
+        return next(one for one in self.books.claims if view.key_of(one) == key)
+
     def _take(self, books: Running, asked: Asked, time: float) -> str:
         received = asked.ticket.received.astimezone(timezone.utc).isoformat(timespec="microseconds")
-        return books.take(asked.goal, time, received.replace("+00:00", "Z"))  # type: ignore[arg-type]
+        return books.take(asked.goal, time, received.replace("+00:00", "Z")).outcome
 
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
@@ -232,14 +241,14 @@ class Oracle:
         """Follow what a generator did by itself: it ends leases, lets in and moves."""
         both = self._claims.keys() & claims.keys()
         moved = {one for one in both if _node(self._claims[one]) != _node(claims[one])}
-        let_in = {demand for demand, _ in claims.keys() - both}
+        let_in = {demand for _, demand in claims.keys() - both}
         self.counts.update(let_in=len(let_in), moved=len(moved))
         for demand in let_in:
-            self.books.book_waiting(demand, self._pushed_at)  # type: ignore[arg-type]
-        for demand, subject in moved:
-            self.books.moved(demand, subject)
+            self.books.book_waiting(demand, self._pushed_at)
+        for key in moved:
+            self.books.moved(self.key_of(key))
         if gone := self._claims.keys() - both:
-            self._end_leases(gone, machine, started, time)
+            self._end_leases([*map(self.key_of, gone)], machine, started, time)
         assert moved or gone or let_in, "a generator acted without a reason"
 
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, str]]:
@@ -258,16 +267,18 @@ class Oracle:
             for operation in trailers.get("Operation-Id", ())
         ]
 
-    def _end_leases(self, gone: Any, machine: Machine, started: float, time: float) -> None:
-        for demand, subject in gone:
-            held, jump = self.books.held[demand][subject], self.world.last_jump
-            assert held.promised is not None and held.seconds is not None, f"{demand}: no lease"
+    def _end_leases(
+        self, gone: list[books.Key], machine: Machine, started: float, time: float
+    ) -> None:
+        for key in gone:
+            claim, jump = self.books.claims[key], self.world.last_jump
+            assert claim.promised is not None and claim.lease is not None, f"{key}: no lease"
             # a machine that saw a jump grants every lease its full term from the jump on
-            full_term = jump + held.seconds if started < jump else jump
-            least = held.promised if jump < 0 else min(held.promised, full_term)
+            full_term = jump + claim.lease if started < jump else jump
+            least = claim.promised if jump < 0 else min(claim.promised, full_term)
             least = max(least, started + max(60, SLACK_S))
-            assert time >= least, f"the lease of {demand} ended {least - time} s early"
-        self.books.gone(gone)
+            assert time >= least, f"the lease of {key} ended {least - time} s early"
+        self.books.drop(gone)
 
     def _assert_in_order(self, asked: Asked) -> None:
         for subject in asked.subjects:
@@ -377,13 +388,13 @@ class Oracle:
             assert machine.generator._demands._journal.pending == {}, "the journal has demands"
             snapshot = machine.generator.snapshot
             assert str(snapshot.commit) == tip, f"{machine.name} is behind"
-            known = claims_of(snapshot.state.ledger)
+            known = view.claims_in_ledger(snapshot.state.ledger)
             assert known == self._claims, f"{machine.name} knows {known}, not {self._claims}"
         for operation, asked in self.asked.items():
             error = asked.is_answered and asked.ticket.future.exception()
             told = f"{operation} is booked, but was answered {error}"
             assert not error or operation not in self._place, told
-        leased = [name_of(claim) for claim in self.claims().values() if claim.lease]
+        leased = [claim.key for claim in self.claims().values() if claim.lease]
         assert not leased, f"leases did not end: {leased}"
         free, drained = self.books.free(), self.books.drained
         on = {node for what, _ in self._claims.values() if (node := what.get("node"))}
@@ -474,5 +485,5 @@ def _rendered_instance(text: str) -> tuple[str, str, list[str], int]:
     return release["metadata"]["namespace"], version, topics, values["replicas"]
 
 
-def _node(claim: tuple[dict[str, Any], frozenset[str]]) -> object:
+def _node(claim: view.Content) -> object:
     return claim[0].get("node")

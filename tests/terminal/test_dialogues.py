@@ -18,7 +18,7 @@ def test_options_that_are_not_given_are_asked_for(checkout: Path) -> None:
         ("Error: 'camera' is not ROLE=TYPE; write it like", "camera=sensor_msgs/Image"),
         ("write camera=sensor_msgs/msg/Image", ""),
         ("Error: an answer is needed; Ctrl-C ends the command", "camera=sensor_msgs/msg/Image"),
-        ("such as detector=my_package/detector.launch.py", "tracker=tracking/tracker.launch.py"),
+        ("such as detector=my_package/detector; separate", "tracker=tracking/tracker"),
         ("with a tag or digest, such as ", "ghcr.io/me/tracking:1.0"),
     ]
     with Dialogue("new", "application", "tracking", folder=checkout) as talk:

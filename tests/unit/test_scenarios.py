@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops.model.config.load import load
@@ -26,7 +24,7 @@ def test_scenario(name: str) -> None:
     assert running.same_faults(scenario.invalid, error.value.faults), told
 
 
-WRONG = plain_yaml.load(Path(__file__).with_name("wrong-scenarios.yaml").read_text())
+WRONG = plain_yaml.beside(__file__, "wrong-scenarios")
 
 
 @pytest.mark.parametrize(("text", "told"), WRONG["unread"])

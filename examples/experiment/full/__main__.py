@@ -11,13 +11,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-from . import large, report, routes
+from . import large, report, routes, unlisted
 from .checks import checks
 from .experiment import ROOT, Experiment
 from .fleet import Carrier
 from .outcome import STAGES, Outcome, Settings, quantiles, savings, steps
 from .rig import chromium, write_bag
 from .rules import Near, bag_tracks
+from .unlisted import UnlistedExperiment
 
 
 def _settings() -> Settings:
@@ -31,6 +32,8 @@ def _settings() -> Settings:
     add("--vanish", choices=routes.VEHICLES, default="", help="who falls silent")
     many = "the larger experiment: 200 vehicles or as many as given, which only send poses"
     add("--large", type=int, nargs="?", const=200, default=0, metavar="VEHICLES", help=many)
+    few = "as many vehicles that nobody listed, two applications, CAMs, and data that come back"
+    add("--unlisted", type=int, nargs="?", const=20, default=0, metavar="VEHICLES", help=few)
     add("--bag", default="", help="take the vehicles' poses from a recorded bag")
     given = parser.parse_args()
     if given.large and (given.gitops, given.connections) != ("flux", "mqtt"):
@@ -54,6 +57,9 @@ def main() -> int:
         crowd = large.LargeExperiment(settings, folder, say)
         outcome = crowd.run()
         found = large.checks(outcome, crowd.passing)
+    elif settings.unlisted:
+        outcome = UnlistedExperiment(settings, folder, say).run()
+        found = unlisted.checks(outcome)
     else:
         outcome = Experiment(settings, folder, say).run()
         found = checks(outcome)

@@ -23,6 +23,7 @@ from .participants import POSE, Plan
 from .process_runner import ProcessRunner
 from .rig import (
     CLUSTER,
+    ENDS_WITH_US,
     PATIENCE_S,
     Client,
     Rig,
@@ -30,7 +31,6 @@ from .rig import (
     demandops,
     environment,
     git,
-    launch,
     limited_world,
     reserved,
 )
@@ -49,6 +49,8 @@ class Experiment:
     def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
         self._settings, self._folder, self._say = settings, folder, say
         self._near, self._routes = Near.read(), settings.routes()
+        self._nodes: tuple[str, ...] = fleet.NODES
+        self._domains: dict[str, int] = {}
         self._stack = ExitStack()
 
     def run(self) -> Outcome:
@@ -60,11 +62,13 @@ class Experiment:
 
     def _start_cluster(self) -> None:
         folder, gitops = self._made("rig"), self._settings.gitops
-        rig = Rig(CLUSTER, folder, gitops=gitops, nodes=fleet.NODES, report=self._say)
+        rig = Rig(CLUSTER, folder, gitops=gitops, nodes=self._nodes, report=self._say)
         self._rig = self._stack.enter_context(rig)
         self._rigs = {CLUSTER: rig}
         self._say("the cluster is up")
-        self._domains = {node: self._stack.enter_context(reserved()) for node in fleet.NODES}
+        for node in self._nodes:
+            if node not in self._domains:
+                self._domains[node] = self._stack.enter_context(reserved())
         self._brokers = {node: Broker(self._made(f"broker-{node}")) for node in ("cloud", "edge")}
         for broker in self._brokers.values():
             self._stack.callback(broker.close)
@@ -79,9 +83,7 @@ class Experiment:
 
     def _start_fleet(self) -> None:
         rig, world = self._rig, self._start_world()
-        ports = {node: broker.port for node, broker in self._brokers.items()}
-        given = (world.file(name) for name in ("inventory/nodes.yaml", "registry/images.yaml"))
-        world.push(fleet.files(*given, self._domains, ports))
+        world.push(self._files({node: broker.port for node, broker in self._brokers.items()}))
         limited_world(world, rig)
         self._runner = ProcessRunner(
             rig.kube,
@@ -91,11 +93,19 @@ class Experiment:
             environment(self._made("containers")) | {"PYTHONPATH": _python_path()},
         )
         self._stack.callback(self._runner.close)
-        self._edge = EdgeObserver(self._domains["edge"])
-        self._cloud = CloudObserver(self._domains["cloud"])
-        for observer in (self._edge, self._cloud):
-            observer.start()
-            self._stack.callback(observer.close)
+        vehicles = [route.vehicle for route in self._routes]
+        self._edge = self._observe(EdgeObserver(self._domains["edge"], vehicles))
+        self._cloud = self._observe(CloudObserver(self._domains["cloud"], vehicles))
+
+    def _files(self, ports: dict[str, int]) -> dict[str, str]:
+        """Return the fleet's files of the state repo, for brokers at these ports."""
+        paths = ("inventory/nodes.yaml", "registry/images.yaml")
+        return fleet.files(*map(self._world.file, paths), self._domains, ports)
+
+    def _observe(self, observer: Any) -> Any:
+        observer.start()
+        self._stack.callback(observer.close)
+        return observer
 
     def _deploy_initially(self) -> None:
         """Let connections carry the vehicles' poses to the cloud, and start the detector there."""
@@ -112,11 +122,10 @@ class Experiment:
         self._say("the initial deployment carries the vehicles' poses to the cloud")
         self._detect(fleet.rules(self._settings.connections))
 
-    def _start_participants(self, station_cloud: str, *, poses_only: bool = False) -> None:
+    def _start_participants(self, station_cloud: str, **more: Any) -> None:
         record, file = str(self._folder / "poses.jsonl"), self._folder / "plan.json"
         seed, origin = self._settings.seed, self._near.point
-        plan = Plan(self._routes, origin, self._domains, seed, record, station_cloud, poses_only)
-        plan.write(file)
+        Plan(self._routes, origin, self._domains, seed, record, station_cloud, **more).write(file)
         self._participants = self._start(
             "participants", "examples.experiment.full.participants", str(file)
         )
@@ -259,7 +268,7 @@ class Experiment:
         stages, inside = self._cloud.commits(), set()
         for commit in self._commits(since):
             read = self._bookkeeping(commit)
-            now = {who for whos in read.values() for who in whos if who in routes.VEHICLES}
+            now = {who for whos in read.values() for who in whos} & self._domains.keys() - {paper.S}
             for vehicle in sorted(now ^ inside):
                 yield Formed(commit, vehicle, vehicle in now, stages.get(commit, {}), read)
             inside = now
@@ -277,7 +286,7 @@ class Experiment:
             given["ROS_DOMAIN_ID"] = str(self._domains[domain])
         with (self._folder / f"{name}.log").open("w") as log:
             process = subprocess.Popen(
-                launch.command(sys.executable, "-m", module, *arguments),
+                [*ENDS_WITH_US, sys.executable, "-m", module, *arguments],
                 env=given,
                 cwd=ROOT,
                 stdin=subprocess.PIPE,

@@ -37,7 +37,8 @@ def files(
     registry: dict[str, Any] = yaml.safe_load(images)
     registry["images"]["zenoh-bridge"] = _BRIDGE
     for node in inventory["nodes"]:
-        node["ros"]["domainId"] = domains[node["id"]]
+        if node["id"] in domains:  # a pattern has its own
+            node["ros"]["domainId"] = domains[node["id"]]
         edge = {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
         node["zenoh"] = edge if node["id"] == "edge" else {}
     brokers = [{"node": node, "host": "127.0.0.1", "port": port} for node, port in ports.items()]
@@ -81,7 +82,8 @@ def is_client(service: str, vehicle: str, carrier: Carrier) -> bool:
     """Return whether a service is a client for this vehicle's connection to the edge alone."""
     if carrier == "zenoh":
         return service == f"zenoh-{vehicle}"
-    return service.startswith(f"mqtt-{vehicle}-edge")
+    ends = service.removeprefix("mqtt-").removeprefix("derived-")
+    return ends != service and ends.startswith(f"{vehicle}-edge-")
 
 
 def initial_deployment(vehicles: Collection[str]) -> dict[str, Any]:

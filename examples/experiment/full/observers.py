@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import time
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,7 @@ from sensor_msgs.msg import PointCloud2
 
 from .fleet import STATION_CLOUD_TARGET
 from .participants import EGO_DATA, POSE, VEHICLE_CLOUD
-from .rig import FUSION, PATIENCE_S, accepts, free_port, launch, wait_until
-from .routes import VEHICLES
+from .rig import ENDS_WITH_US, FUSION, PATIENCE_S, accepts, free_port, wait_until
 
 FUSION_NODE = FUSION.replace("-", "_")
 FUSED = "/edge_object_detection_fusion_global_objectlist"
@@ -57,12 +57,12 @@ class Observer:
 class EdgeObserver(Observer):
     """Records the messages at the edge, the topics that the fusion reads, and the fused objects."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, vehicles: Iterable[str]) -> None:
         super().__init__(domain)
         self.inputs: list[tuple[float, frozenset[str]]] = [(time.time(), frozenset())]
         self.tracks: list[tuple[float, list[tuple[float, float]]]] = []
         self.bytes: Counter[str] = Counter()
-        for vehicle in VEHICLES:
+        for vehicle in vehicles:
             self.watch(PoseStamped, EGO_DATA.format(vehicle))
             self._weigh(PoseStamped, EGO_DATA.format(vehicle))
             self._weigh(PointCloud2, VEHICLE_CLOUD.format(vehicle))
@@ -95,10 +95,10 @@ class EdgeObserver(Observer):
 class CloudObserver(Observer):
     """Records the poses that arrive in the cloud, and the stages of each demand."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, vehicles: Iterable[str] = ()) -> None:
         super().__init__(domain)
         self.stages: dict[bytes, dict[str, tuple[float, str]]] = defaultdict(dict)
-        for vehicle in VEHICLES:
+        for vehicle in vehicles:
             self.watch(PoseStamped, POSE.format(vehicle))
         self.node.create_subscription(
             DeploymentRequest.Impl.FeedbackMessage,
@@ -135,7 +135,7 @@ class Broker:
         configuration.write_text(f"listener {self.port} 127.0.0.1\nallow_anonymous true\n")
         with (folder / "mosquitto.log").open("w") as log:
             self._process = subprocess.Popen(
-                launch.command(program, "-c", str(configuration)), stdout=log, stderr=log
+                [*ENDS_WITH_US, program, "-c", str(configuration)], stdout=log, stderr=log
             )
         self._counter = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
         self._counter.on_connect = lambda client, *_: client.subscribe("#")

@@ -28,6 +28,7 @@ from typing import Any
 
 import rclpy
 from geometry_msgs.msg import PoseStamped
+from pyproj import Geod
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
@@ -41,6 +42,8 @@ POSE = "/vehicles/{}/pose"
 EGO_DATA = "/vehicles/{}/ego_data"
 VEHICLE_CLOUD = "/vehicles/{}/drivers/lidar/pointcloud"
 STATION_CLOUD = f"/stations/{STATION}/drivers/lidar/pointcloud"
+
+CAMS = "/cams"
 
 POSE_HZ = 10
 POSES_PER_CLOUD = 2
@@ -86,7 +89,9 @@ class Plan:
     `routes` has each vehicle's way, `origin` the position of the intersection on the map, and
     `domains` the ROS domain of each node. The program records all poses that it sends; `record` is
     the file for them. `station_cloud` is the topic of the station's point cloud. With `poses_only`,
-    one ROS node in the cloud's domain sends all poses, and nothing else is sent.
+    one ROS node in the cloud's domain sends all poses, and nothing else is sent. With `on_earth`,
+    the latitude and longitude of the origin, the vehicles send CAMs in place of poses: a road-side
+    unit in the cloud's domain publishes all of them on one topic.
     """
 
     routes: tuple[Way, ...]
@@ -96,6 +101,7 @@ class Plan:
     record: str
     station_cloud: str
     poses_only: bool = False
+    on_earth: tuple[float, float] | None = None
 
     def write(self, file: Path) -> None:
         routes = [vars(route) for route in self.routes]
@@ -123,7 +129,8 @@ class Participant:
         self.sent: Counter[str] = Counter()
 
     def send(self, topic: str, message: Any, now: float) -> None:
-        message.header.stamp.sec, message.header.stamp.nanosec = int(now), int(now % 1 * 1e9)
+        if hasattr(message.header, "stamp"):
+            message.header.stamp.sec, message.header.stamp.nanosec = int(now), int(now % 1 * 1e9)
         if topic not in self._publishers:
             self._publishers[topic] = self.node.create_publisher(type(message), topic, 10)
         data = serialize_message(message)
@@ -143,6 +150,8 @@ class Participants:
             self._by_name = dict.fromkeys(names, Participant("crowd", plan.domains["cloud"]))
         else:
             self._by_name = {name: Participant(name, plan.domains[name]) for name in names}
+            if plan.on_earth:
+                self._by_name["radio"] = Participant("radio", plan.domains["cloud"])
         self._sent = Path(plan.record).open("w", buffering=1)  # noqa: SIM115 - open as long as this object
         self.set_off: float | None = None
         self.until, self.held = 0.0, 0.0
@@ -177,9 +186,27 @@ class Participants:
         message.header.frame_id = "map"
         message.pose.position.x, message.pose.position.y = x, y
         message.pose.orientation.w = 1.0
-        for topic in (POSE,) if self._plan.poses_only else (POSE, EGO_DATA):
-            self._by_name[vehicle].send(topic.format(vehicle), message, now)
+        if self._plan.on_earth:
+            self._by_name["radio"].send(CAMS, self._cam(vehicle, x, y), now)
+        else:
+            self._by_name[vehicle].send(POSE.format(vehicle), message, now)
+        if not self._plan.poses_only:
+            self._by_name[vehicle].send(EGO_DATA.format(vehicle), message, now)
         print(json.dumps({"at": now, "vehicle": vehicle, "x": x, "y": y}), file=self._sent)
+
+    def _cam(self, vehicle: str, x: float, y: float) -> Any:
+        """Return a vehicle's CAM; the number in its name is its station id."""
+        # only `make experiment` builds the message
+        from etsi_its_cam_msgs.msg import CAM
+
+        latitude, longitude = self._plan.on_earth or (0.0, 0.0)
+        azimuth, metres = math.degrees(math.atan2(x, y)), math.hypot(x, y)
+        east, north, _ = Geod(ellps="WGS84").fwd(longitude, latitude, azimuth, metres)
+        message = CAM()
+        message.header.station_id.value = int(vehicle.removeprefix("vehicle"))
+        position = message.cam.cam_parameters.basic_container.reference_position
+        position.latitude.value, position.longitude.value = round(north * 1e7), round(east * 1e7)
+        return message
 
     def _send_clouds(self, where: dict[str, Place], elapsed: float, now: float) -> None:
         seen = self._cloud(self._plan.origin, where.values())

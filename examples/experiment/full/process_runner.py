@@ -29,7 +29,7 @@ from kubernetes.client.exceptions import ApiException
 from kubernetes.watch import Watch
 from urllib3.exceptions import HTTPError
 
-from .rig import PATIENCE_S, Kube, Manifest, launch, volume_files
+from .rig import ENDS_WITH_US, PATIENCE_S, Kube, Manifest, volume_files
 
 _TICK_S = 0.1
 _WATCH_S = 60
@@ -276,7 +276,7 @@ class ProcessRunner:
     def _start(self, pod: RunningPod, container: Container) -> None:
         environment = self._environment | container.environment
         # `env` looks for the program on the container's PATH, as a container's runtime does
-        command = launch.command("/usr/bin/env", *container.command)
+        command = [*ENDS_WITH_US, "/usr/bin/env", *container.command]
         with (pod.folder / f"{container.name}.log").open("ab") as log:
             container.process = subprocess.Popen(
                 command,

@@ -9,7 +9,7 @@ from tests.e2e.common.access import access_file, documented_roles, limited, limi
 from tests.e2e.common.expected import CLUSTER, FUSION, WITHOUT_DEMANDS
 from tests.e2e.common.volumes import files as volume_files
 from tests.e2e.common.world import World, demandops, environment
-from tests.e2e.rig import launch
+from tests.e2e.rig import ENDS_WITH_US
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Kube, Manifest
 from tests.e2e.rig.net import accepts, free_port

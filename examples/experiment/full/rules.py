@@ -36,9 +36,9 @@ class Near:
     timeout: float
 
     @classmethod
-    def read(cls) -> Near:
-        """Return the condition that all rules of the experiment have in common."""
-        data: dict[str, Any] = yaml.safe_load(RULES.read_text())
+    def read(cls, rules: Path = RULES) -> Near:
+        """Return the condition that all rules of a file have in common."""
+        data: dict[str, Any] = yaml.safe_load(rules.read_text())
         (source,) = data["sources"].values()
         (near,) = {json.dumps(rule["near"], sort_keys=True) for rule in data["rules"]}
         found = json.loads(near)

@@ -315,7 +315,7 @@ def all_names(repo: Reader, kind: str) -> Iterator[str]:
         yield from world.ledger.subjects(SubjectKind(kind))
     else:
         yield from {
-            "nodes": world.config.nodes,
+            "nodes": (*world.config.nodes, *world.config.node_patterns),
             "domains": world.config.domains,
             "overrides": world.config.overrides,
             "appdefs": world.config.appdefs,

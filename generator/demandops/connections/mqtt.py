@@ -51,6 +51,11 @@ class Mqtt(ConnectionType):
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         if choose_broker(connection, config) is not None:
             return
+        for node in _asked(connection, config):
+            if problem := config.unlisted_brokers.find(node)[1]:
+                place = config.place_of(configs.BROKERS_FILE)
+                yield fault("broker", f"{quoted(node)} {problem} ({place})", code=_NO_BROKER)
+                return
         remedy = f"name one of: {', '.join(sorted(config.brokers))}"
         place = config.place_of(configs.DOMAINS_FILE)
         remedy += f", or ask for a 'broker' of the access domain in {place}"
@@ -108,13 +113,19 @@ def choose_broker(connection: Connection, config: Config) -> Broker | None:
     # as the reference chooses: the only broker, or else the named one, then that of an end
     if len(config.brokers) == 1 and not config.broker_patterns:
         return next(iter(config.brokers.values()))
+    for node in _asked(connection, config):
+        if node in config.brokers:
+            return config.brokers[node]
+        if config.unlisted_brokers.find(node)[1]:
+            return None  # what the patterns do not say clearly is refused, not passed over
+    return None
+
+
+def _asked(connection: Connection, config: Config) -> Iterator[str]:
     ends = (connection.target, connection.source)
     domains = (domain for end in ends if (domain := config.domain_of.get(end)))
     defaults = (domain.broker or "" for domain in domains)
-    for node in map(config.host_of, (connection.broker, *ends, *defaults)):
-        if node in config.brokers:
-            return config.brokers[node]
-    return None
+    return map(config.host_of, (connection.broker, *ends, *defaults))
 
 
 @dataclass(frozen=True, slots=True)

@@ -477,6 +477,7 @@ class Answer:
     faults: tuple[Fault, ...]  # why not
     rules: tuple[str, ...]  # what allows it
     approval: tuple[str, ...]  # what requires that a person approves it
+    approved_by: tuple[str, ...] = ()  # the rules without which a person would have to
 
 
 def may_demand(
@@ -515,8 +516,8 @@ def may_demand(
             and permission.first_uncovered(rule, access) is None
         )
         pairs = ((change.before, change.after) for change in changes.claims)
-        approval, _ = permission.approval(demand, pairs, config)
-        answer = Answer(name, tuple(dict.fromkeys(faults)), tuple(rules), approval)
+        approval = permission.approval(demand, pairs, config)
+        answer = Answer(name, tuple(dict.fromkeys(faults)), tuple(rules), *approval)
         if not faults:
             break
     return answer

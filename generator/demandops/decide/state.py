@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from rpds import HashTrieMap
 
@@ -78,6 +78,17 @@ class State(World):
         object.__setattr__(state, "_names", names)
         return state
 
+    def with_nodes(self, config: Config) -> State:
+        """Return the state with nodes that differ only in what a choice of nodes depends on.
+
+        Nothing that runs differs, so all that was counted of it stays valid.
+        """
+        state = replace(self, config=config)
+        object.__setattr__(state, "_names", self._names)
+        if config.limits_capacity == self.config.limits_capacity:
+            object.__setattr__(state, "_usage", self._usage)
+        return state
+
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
         state, changes = replace(self, ledger=ledger), tuple(changes)
         # If a definition is gone, ``names`` and ``usage`` look at all releases again.
@@ -129,6 +140,19 @@ class ReleaseChange:
         # a sign before it says what starts and what stops
         effect = f", {self.effect}" if self.change == "change" and self.effect else ""
         return f"{self.name} ({self.what}){effect}"
+
+
+_MOST_NAMES = 5
+
+
+def effects_of(releases: Collection[ReleaseChange]) -> Iterator[str]:
+    """Yield a text for each effect, such as "reconfigures of-edge-fusion", for a receipt."""
+    for effect in get_args(Effect):
+        names = [each.name for each in releases if effect and each.effect == effect]
+        if names:
+            more = len(names) - _MOST_NAMES
+            shown = ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
+            yield f"{effect} {shown}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,13 +297,13 @@ def describe_change(
         old_facts, new_facts = frozenset(before), frozenset(after)
         details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
         details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
-    effect = _effect(old, new, current, text)
+    effect = effect_on_pods(old, new, current, text)
     return ReleaseChange(
         release.name, release.description, path_of(release), kind, tuple(details), effect
     )
 
 
-def _effect(
+def effect_on_pods(
     old: Release | None, new: Release | None, current: str | None, text: str | None
 ) -> Effect:
     if text is None or current is None:

@@ -16,7 +16,7 @@ from demandops.base.errors import Fault, InvalidInput, fault, suggestion
 from demandops.base.quantities import amount_of, amount_text
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
-from demandops.decide.admission.permission import PEERS, needed_access
+from demandops.decide.admission.permission import PEERS, first_uncovered, needed_access
 from demandops.decide.booking import Drain
 from demandops.decide.checks.collisions import Names, publishers, topics_made
 from demandops.decide.placement.candidates import lacks, requirement_of, unmet
@@ -24,16 +24,18 @@ from demandops.decide.placement.relocation import following_overrides, with_move
 from demandops.decide.planning.flows import flows_without_carrier, topics_of_origin
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import claims_needing
-from demandops.decide.state import State
+from demandops.decide.state import State, trial_releases
 from demandops.model.config.appdef import ignored_fields
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, NODES_FILE, Config
+from demandops.model.config.entry_patterns import may_match
 from demandops.model.config.override import Override
 from demandops.model.demand.demand import Application, Demand, Held
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import Changes, World
 from demandops.model.release import Release
+from demandops.render.gitops import values_of
 from demandops.templating.charts import defaults, overridden
 from demandops.templating.values import takes_requests
 
@@ -312,6 +314,38 @@ def request_warnings(config: Config) -> Iterator[Fault]:
                 yield fault("", message).within(template)
 
 
+# ---- values that a running service is said to take over ----
+
+
+def live_warnings(state: State) -> Iterator[Fault]:
+    """Warn of ``live`` values that do not exist, or for which the chart starts the pods anew."""
+    config = state.config
+    found = dict[Fault, None]()  # one instance of a service has what another has
+    for release in (each for releases in trial_releases(config).values() for each in releases):
+        service, chart, known = release.service, release.chart, dict[str, object]()
+        with suppress(InvalidInput):  # which is told as a fault, or is YAML that only Helm reads
+            known |= defaults(chart.folder, config.files) if chart.folder else {}
+            known |= values_of(release, config, state.evaluate)
+        place = "live" if service.shared else f"services.{service.name}.live"
+        for name in service.live:
+            # a template may write a value only sometimes
+            written = re.search(rf"(?m)^{re.escape(name)}:", config.files.get(service.values, ""))
+            if name not in known and not written:
+                problem = (
+                    f"'{name}' is no value that {service.values} writes or the chart "
+                    f"'{service.chart}' has; correct it, or remove it{suggestion(name, known)}"
+                )
+            elif name == "parameters" and known.get("reconfigure") == "restart":
+                problem = (
+                    f"'{name}' restarts the pods, as `reconfigure: restart` of the chart "
+                    f"'{service.chart}' says; remove it here, or write `reconfigure: live` there"
+                )
+            else:
+                continue
+            found[fault(place, problem).within(service.file)] = None
+    yield from found
+
+
 _TRUTH = re.compile(  # a brace inside a text is that of a placeholder: vehicle{n}
     r"(?:^|[:,\[-]|(?<![^\s\[{,:-])\{)[ ]*"
     r"\b([yY]|[nN]|[yY]es|YES|[nN]o|NO|[oO]n|ON|[oO]ff|OFF)[ ]*(?=[,\]}]|$)"
@@ -340,6 +374,7 @@ def truth_warnings(files: Mapping[str, str]) -> Iterator[Fault]:
 def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
     kinds_of_nodes = sorted(config.kinds_of_nodes(), key=lambda node: node.id)
     nodes = tuple(node.id for node in kinds_of_nodes)
+    brokers = (*config.brokers, *config.broker_patterns)
     for name, domain in sorted(config.domains.items()):
         own = tuple(node.id for node in kinds_of_nodes if domain in config.domains_at(node))
         others = tuple(sorted(config.domains.keys() - {name}))
@@ -347,7 +382,7 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
         kinds = [("nodes", domain.nodes, "node", nodes)]
         for rule in domain.rules:
             place = f"rule '{rule.name}'"
-            appdefs, brokers = (*config.appdefs,), (*config.brokers,)
+            appdefs = (*config.appdefs,)
             kinds += [
                 (f"{place}: applications", rule.applications, "application definition", appdefs),
                 (f"{place}: nodes", rule.nodes, "node of the domain", own),
@@ -357,7 +392,7 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
         file = config.file_of(DOMAINS_FILE, name)
         for where, patterns, what, names in kinds:
             for pattern in patterns:
-                if pattern != "*" and not any(matches(each, (pattern,)) for each in names):
+                if pattern != "*" and not may_match(pattern, names):
                     hint = suggestion(pattern, names) or "; there is none"
                     message = f"{quoted(pattern)} matches no {what}{hint}"
                     yield fault(f"access domain '{name}', {where}", message).within(file)
@@ -372,6 +407,7 @@ _MOST_NODES = 3
 
 def policy_warnings(world: State) -> Iterator[Fault]:
     config = world.config
+    yield from _approvals_not_needed(config)
     yield from _open_by_host_network(config)
     yield from _connections_no_longer_allowed(world)
     for (id, resource), used in sorted(world.usage().amounts.items()):
@@ -408,6 +444,23 @@ def policy_warnings(world: State) -> Iterator[Fault]:
             yield fault(field, message).within(file)
     for path, text in following_overrides(world).stays:
         yield fault("node", text).within(path)
+
+
+def _approvals_not_needed(config: Config) -> Iterator[Fault]:
+    fields = ("requesters", "applications", "nodes")
+    for name, domain in sorted(config.domains.items()):
+        free = [rule for rule in domain.rules if not domain.asks(rule)]
+        for rule in filter(domain.asks, domain.rules):
+            # a pattern covers another if it matches it as text, with `*` longer than any `???`
+            needed = [(f, p.replace("*", "*" * 99)) for f in fields for p in getattr(rule, f)]
+            for other in (each for each in free if not first_uncovered(each, needed)):
+                message = (
+                    f"rule '{rule.name}' requires approval, but '{other.name}' covers the same "
+                    "requesters and does not, so nobody is asked; one rule without approval is "
+                    f"enough; narrow '{other.name}', or let it require approval too"
+                )
+                file = config.file_of(DOMAINS_FILE, name)
+                yield fault(f"access domain '{name}'", message).within(file)
 
 
 def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:

@@ -20,7 +20,7 @@ from demandops.base.quoting import quoted
 from demandops.cluster.health import Target
 from demandops.cluster.rollouts import targets_of_decision
 from demandops.decide.decision import Decision, Outcome
-from demandops.decide.state import State
+from demandops.decide.state import State, effects_of
 from demandops.model.demand.demand import UNSTARTED, Demand
 from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger.ledger import ClaimChange
@@ -62,6 +62,7 @@ class Receipt:
     warnings: tuple[str, ...] = ()
     not_held: tuple[str, ...] = ()
     placed: tuple[str, ...] = ()  # which nodes the generator chose, and why
+    effects: tuple[str, ...] = ()  # what becomes of which releases
     lease_s: int | None = None
     targets: tuple[Target, ...] = ()  # the releases to follow, if the generator was asked for them
     changes: tuple[ClaimChange, ...] = ()
@@ -78,6 +79,7 @@ class Receipt:
             warnings=decision.warnings,
             not_held=decision.changes.not_held,
             placed=decision.placed,
+            effects=(*effects_of(decision.releases),),
             lease_s=decision.lease_s,
             targets=targets_of_decision(before, decision) if with_targets else (),
             changes=decision.changes.claims,
@@ -475,7 +477,7 @@ def drop(root: Path, operation: str) -> Path | None:
                 branch = ticket.proposal.branch
                 raise StateRepoError(
                     f"demand {operation} awaits approval on {branch}; turn it down with "
-                    f"`demandops reject {branch}`"
+                    f"`demandops reject {branch} -m REASON`"
                 )
             journal = Journal(file)
             journal.mark_done([operation], durably=True)

@@ -30,6 +30,7 @@ from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
 
 _EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
 _PLACE = re.compile(r"line (\d+)")
+_PARAMETER = re.compile(r"\bparameters(?:\.|\[['\"])(\w+)")
 # The most characters that a searched line may have. The search for a longer line could take too
 # long.
 _LONGEST = 2_000
@@ -173,8 +174,13 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
         if task.chart:
             _check(values, task.chart, files, task.file, "the template")
     except InvalidInput as error:
-        template = files[task.file]
-        raise InvalidInput(with_template_lines(error.faults, template, text)) from None
+        template, faults = files[task.file], list[Fault]()
+        for each in with_template_lines(error.faults, template, text):
+            line = template.splitlines()[each.line - 1] if each.line else ""
+            named = ", ".join(dict.fromkeys(_PARAMETER.findall(line)))
+            hint = f", or demand another value of the parameter {named}" if named else ""
+            faults.append(replace(each, message=each.message + hint))
+        raise InvalidInput(faults) from None
     below: dict[str, Any] | None = None
     if task.chart and task.patches:
         with suppress(InvalidInput):  # YAML that only Helm reads, for example with anchors

@@ -6,11 +6,12 @@ import json
 import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timedelta
 from itertools import islice
 from typing import Any
 
+from demandops.base.errors import InvalidInput
 from demandops.base.naming import SubjectKind
 from demandops.base.placeholders import is_pattern
 from demandops.cluster.health import Health
@@ -22,15 +23,16 @@ from demandops.decide.bookkeeping import (
     versions_asked,
 )
 from demandops.decide.planning.overrides import suspended_by
-from demandops.model.config.base_model import duration_text, parse_time, relative
-from demandops.model.config.config import DOMAINS_FILE
-from demandops.model.config.override import OVERRIDES_ROOT
+from demandops.model.config.base_model import duration_text, parse_file, parse_time, relative
+from demandops.model.config.config import DOMAINS_FILE, NODES_FILE
+from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import PROPOSAL, REJECTS
+from demandops.repo.reader import Reader
 from demandops.views import vocabulary
 from demandops.views.rows import Column, Row, TextsOf
 from demandops.views.source import Source, since_of, word_of, worst_word
@@ -52,13 +54,16 @@ class Kind:
     item: Callable[..., Json] = lambda source, item: item
     # Further texts by which an item is found, by label.
     labels: Callable[[Json], dict[str, Iterable[str]]] = lambda item: {}
-    trailer: str = ""  # of commits: names what their commit changes, so that its past can be listed
-    # What an item has that is gone, beside nulls; None if its past cannot be listed.
-    blank: Json | None = None
+    # The past can be listed of what a trailer of commits names, or of what has a file of this glob.
+    trailer: str = ""
+    files: str = ""
+    # What an item has that is gone, beside nulls; and what its last commit and its file tell of it.
+    blank: Json = field(default_factory=dict)
+    was: Callable[[Reader, LogEntry, str], Json] = lambda reader, entry, path: {}
 
     @property
     def has_past(self) -> bool:
-        return bool(self.trailer) or self.blank is not None
+        return bool(self.trailer or self.files)
 
     @property
     def word(self) -> str:
@@ -104,7 +109,7 @@ def rows_of(source: Source, name: str) -> list[Row]:
 _ENDING = frozenset({"shutdown", "release", "expire", "decommission", "rollback"})
 
 
-def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
+def past_rows(source: Source, name: str) -> tuple[list[Row], str]:  # noqa: PLR0912 - a rule each
     """Return what is gone, the newest first, and the commit where the search ended, if it did.
 
     The newest commit that names a thing which is not there now is the one that ended it. What came
@@ -115,18 +120,21 @@ def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
     for row in rows_of(source, name):
         since = row.item.get("since") if kind.trailer else None
         began[row.item["name"]] = parse_time(since) if since else None
-    stopped = dict[str, list[str]]()
-    if name == "releases":
-        stopped = commit_log.stopped_releases(reader.objects, source.commit)
+    removed = dict[str, dict[str, str]]()
+    if kind.files:
+        removed = commit_log.removed_files(reader.objects, source.commit, kind.files)
     for number, entry in enumerate(reader.log(source.commit)):
         if number == MOST_COMMITS:
             return [*map(kind.row, past.values())], entry.commit
         by, time, operation = entry.author, entry.time, entry.first("Operation")
-        named = entry.trailers.get(kind.trailer, stopped.get(entry.commit, ()))
-        if name == "proposals" and entry.answer:
-            by, time, operation = entry.answer.by, entry.answer.time, entry.answer.outcome
-            # of a rejection, the branch and the commit that was proposed
-            named = named or [entry.first(REJECTS).partition(" ")[0]]
+        reason = entry.first("Reason") if operation else entry.why
+        files, rejected = removed.get(entry.commit, {}), entry.trailers.get(REJECTS, ())
+        named = entry.trailers.get(kind.trailer, [*files])
+        if name == "proposals" and (answer := entry.answer):
+            by, time, operation, reason = answer.by, answer.time, answer.outcome, answer.reason
+            named = named or [each.partition(" ")[0] for each in rejected]
+        elif rejected:
+            continue  # what was proposed, and never was there
         for gone in named:
             if gone in began:
                 now = began[gone]
@@ -134,15 +142,19 @@ def past_rows(source: Source, name: str) -> tuple[list[Row], str]:
                     began[gone] = now = None
                 if now is None or (gone not in past and operation not in _ENDING):
                     continue
-            item: Json = {column.key: None for column in kind.columns} | (kind.blank or {})
+            item: Json = {column.key: None for column in kind.columns} | kind.blank
             item |= {"name": gone, "state": "back" if gone in began else "gone"}
             item |= {"requesters": [], "applications": [], "connections": []}
             item["ended"] = {"time": time_data(time), "by": by, "operation": operation or None}
-            item["ended"]["commit"] = entry.commit
-            item = past.setdefault(gone, item)
-            item["since"] = time_data(entry.time)  # of the oldest commit that names it
+            item["ended"] |= {"reason": reason or None, "commit": entry.commit}
+            if gone not in past:
+                past[gone] = item | kind.was(reader, entry, files.get(gone, ""))
+            item = past[gone]
+            if not kind.files:
+                item["since"] = time_data(entry.time)  # of the oldest commit that names it
             if len(named) == 1 and not item["requesters"]:  # what a commit names is all of it
                 item["requesters"] = entry.trailers.get("Requester", [])
+                item["demands"] = entry.trailers.get("Demand-Id", [])
                 item["applications"] = entry.trailers.get("Application", [])
                 item["connections"] = entry.trailers.get("Connection", [])
     return [*map(kind.row, past.values())], ""
@@ -176,6 +188,7 @@ def _ended(item: Json, now: datetime) -> str:
     if not (ended := item.get("ended")):
         return ""
     how = f", {ended['operation']}" if ended["operation"] else ""
+    how += f" in {ended['commit'][:10]}" + (f": {ended['reason']}" if ended["reason"] else "")
     return f"{relative(parse_time(ended['time']), now)} by {ended['by']}{how}"
 
 
@@ -420,6 +433,12 @@ def release_of(source: Source, release: Release) -> Json:
     return _release(source, release, source.claims_of_releases[release.name], status)
 
 
+def _release_was(reader: Reader, entry: LogEntry, path: str) -> Json:
+    _, cluster, domain, node, _ = path.split("/")
+    place = {"node": node, "cluster": cluster, "domains": [domain]}
+    return place | {"requesters": entry.trailers.get("Requester", [])}
+
+
 def _services(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     yield from (each for each in _releases(source) if isinstance(each[1][0], ServiceRelease))
 
@@ -544,6 +563,7 @@ def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
         "type": node.type if node else None,
         "cluster": node.cluster if node else None,
         "domain": domain.name if domain else None,
+        "file": source.config.entry_files[NODES_FILE].get(source.config.host_of(id)),
         "drained": bool(node and node.drained),
         "capabilities": list(node.capabilities) if node else [],
         "properties": dict(node.properties) if node else {},
@@ -614,6 +634,15 @@ def _overrides(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
         yield entry.override.name, (item,)
 
 
+def _override_was(reader: Reader, entry: LogEntry, path: str) -> Json:
+    text, name = reader.file_reader(f"{entry.commit}~1")(path) or "", path.rsplit("/", 1)[-1]
+    try:
+        file = parse_file(OverrideFile, text, path)
+        return vocabulary.override_data(Override.from_file(name.removesuffix(".yaml"), file))
+    except InvalidInput:  # it never was in effect
+        return {}
+
+
 def effect_texts(override: Json, *_: object) -> list[str]:
     shown = ("version", "replicas", "node")
     listed = ("images", "values")
@@ -637,6 +666,13 @@ def _proposals(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
         data = asdict(proposal) | {"since": time_data(proposal.since)}
         link = source.proposal_links.get(proposal.branch)
         yield proposal.branch, ({"name": proposal.branch, **data, "link": link},)
+
+
+def _proposal_was(reader: Reader, entry: LogEntry, path: str) -> Json:
+    # a rejection names the branch and the commit that was proposed
+    commit = entry.first(REJECTS).partition(" ")[2] or entry.commit
+    required = entry.trailers.get("Approval-Required-By", [])
+    return {"commit": commit, "summary": entry.summary, "required_by": required}
 
 
 def _events(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -701,7 +737,9 @@ KINDS: dict[str, Kind] = {
             ),
             _releases,
             _release,
+            files=commit_log.RELEASE_FILES,
             blank={"versions_asked": {}, "application_version": None, "object": None},
+            was=_release_was,
         ),
         Kind(
             "services",
@@ -725,7 +763,7 @@ KINDS: dict[str, Kind] = {
             "connections",
             "Topics that are carried from one node to another.",
             (
-                *(_named("connection"), HEALTH, Column("type", "Type", 4)),
+                *(_named("connection"), HEALTH, ENDED, Column("type", "Type", 4)),
                 Column("source", "From", 2, links="node"),
                 *(Column("target", "To", 2, links="node"), REQUESTERS),
                 Column("topics", "Topics", 5, texts_of=_topics),
@@ -739,6 +777,7 @@ KINDS: dict[str, Kind] = {
                 "to": [item["target"]],
             },
             trailer="Connection",
+            blank={"topics": {}},
         ),
         Kind(
             "leases",
@@ -761,7 +800,7 @@ KINDS: dict[str, Kind] = {
                     "releases", "Releases", 5, texts_of=lambda item, now: str(len(item["releases"]))
                 ),
                 *(REQUESTERS, _wide("capabilities", "Capabilities")),
-                _wide("properties", "Properties", texts_of=_properties),
+                *(_wide("properties", "Properties", texts_of=_properties), _wide("file", "File")),
             ),
             _nodes,
             _node,
@@ -819,7 +858,8 @@ KINDS: dict[str, Kind] = {
             "overrides",
             "What runs otherwise than demanded, and why.",
             (
-                *(_named("override"), STATE, Column("effects", "Does", 2, texts_of=effect_texts)),
+                *(_named("override"), STATE, ENDED),
+                Column("effects", "Does", 2, texts_of=effect_texts),
                 *(Column("until", "Until", 3, "time"), Column("owner", "Owner", 4)),
                 *(Column("releases", "To", 5, texts_of=_affected), Column("reason", "Reason", 6)),
                 _wide("priority", "Priority"),
@@ -835,6 +875,9 @@ KINDS: dict[str, Kind] = {
                 "requester": [who for claim in item["claims"] for who in claim["requesters"]],
                 "demand": [claim["demand"] for claim in item["claims"]],
             },
+            files=f"{OVERRIDES_ROOT}/*.yaml",
+            blank={"effects": {}, "releases": [], "claims": []},
+            was=_override_was,
         ),
         Kind(
             "proposals",
@@ -846,11 +889,11 @@ KINDS: dict[str, Kind] = {
                 _wide("demands", "Demands", "demand"),
                 _command("See", lambda item: ["git", "diff", f"origin/main...{item['commit']}"]),
                 _command("Approve", lambda item: _decide(item, "approve")),
-                _command("Refuse", lambda item: _decide(item, "reject")),
+                _command("Refuse", lambda item: [*_decide(item, "reject"), "-m", "REASON"]),
             ),
             _proposals,
             trailer=PROPOSAL,
-            blank={"commit": ""},
+            was=_proposal_was,
         ),
         Kind(
             "events",

@@ -23,6 +23,7 @@ from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.decide.decision import Decision, decide
 from demandops.decide.override_report import affected_releases
+from demandops.decide.state import effect_on_pods
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.config import DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
 from demandops.model.config.repo_settings import ROOT_FILE
@@ -100,7 +101,9 @@ def find(source: Source, name: str, kind: str | None = None) -> Thing:
     # a part of a release's name, or the start of a demand's id; what runs before what has ended
     running = sorted(release for release in source.releases if name in release)
     demands = sorted(id for id in _demands(source) if id.startswith(name))
-    stopped = commit_log.stopped_releases(reader.objects, source.commit).values()
+    stopped = commit_log.removed_files(
+        reader.objects, source.commit, commit_log.RELEASE_FILES
+    ).values()
     ended = sorted({release for names in stopped for release in names})
     were = [release for release in ended if name in release]
     past = {id for entry in reader.log(source.commit) for id in entry.trailers.get("Demand-Id", ())}
@@ -489,22 +492,25 @@ def commits_of(answer: Json) -> list[tuple[str, Json]]:
     return [(word, each) for word, each in (*commits, ("started", answer["started"])) if each]
 
 
-def last_difference(source: Source, answer: Json) -> list[Json]:
+def last_difference(source: Source, answer: Json) -> tuple[list[Json], str]:
     """Return the lines that the newest change of a thing's file added, removed and kept.
 
-    The sign of a line is ``+``, ``-``, ``@`` at the head of a section, or empty.
+    The sign of a line is ``+``, ``-``, ``@`` at the head of a section, or empty. With them, what
+    the change did to the pods of a release that runs.
     """
     if not answer["file"] or not (commits := commits_of(answer)):
-        return []
+        return [], ""
     reader, last = source.reader(), commits[0][1]["commit"]
     after, before = reader.file_reader(last)(answer["file"]) or "", ""
     with suppress(DemandOpsError):  # the first commit has no parent to compare with
         before = reader.file_reader(f"{last}~1")(answer["file"]) or ""
     lines = difflib.unified_diff(before.splitlines(), after.splitlines(), lineterm="", n=2)
-    return [
+    release = source.releases.get(answer["name"]) if answer["kind"] == "release" else None
+    shown = [
         {"sign": (sign := line[:1].strip()), "text": line if sign == "@" else line[1:]}
         for line in list(lines)[2:]  # without the two lines that name the files
     ]
+    return shown, effect_on_pods(release, release, before or None, after) if release else ""
 
 
 # ---- what would follow ----

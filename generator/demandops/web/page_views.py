@@ -282,6 +282,7 @@ def thing(source: Source, name: str, kind: str, health: Iterable[Event]) -> Data
     names = {name, *(release["name"] for release in answer.get("releases", ()))}
     events += [change for change in health if change.release in names]
     claims, releases = answer.get("claims", ()), answer.get("releases", ())
+    difference, effect = last_difference(source, answer)
     data: Data = {
         "it": answer,
         "word": word,
@@ -289,7 +290,8 @@ def thing(source: Source, name: str, kind: str, health: Iterable[Event]) -> Data
         "releases": _table(KINDS["releases"], releases[:_MOST_ROWS], source.now),
         "most": _MOST_ROWS,
         "events": sorted(events, key=lambda event: event.time, reverse=True),
-        "difference": last_difference(source, answer),
+        "difference": difference,
+        "effect": effect,
         "text": answer["file"] and source.reader().file_reader(source.commit)(answer["file"]),
         "released": None,
         "stopped_with": [],

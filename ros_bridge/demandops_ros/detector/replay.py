@@ -239,6 +239,7 @@ def _text(x: float, y: float, text: str, color: str) -> str:
 
 # How many messages the detector gets at a time; the number does not change the events.
 _TOGETHER = 1_000
+_MOST_LISTED = 8  # entities
 _TRACK_M = 0.5  # the least distance in metres between two points of an entity's track in the plot
 
 
@@ -254,6 +255,31 @@ class Replay:
     left_out: Mapping[tuple[str, str], int] = field(default_factory=dict)
     # Each entity's path, for a plot.
     tracks: dict[tuple[str, str], list[tuple[float, float]]] = field(default_factory=dict)
+    heard: set[tuple[str, str]] = field(default_factory=set)  # sources with their entities
+
+    def without_events(self) -> Iterator[tuple[str, str]]:
+        """Yield each rule that had no event, and what its entities did instead."""
+        for rule in self.file.rules:
+            if any(event.rule == rule.name for event, _ in self.events):
+                continue
+            seen = sorted({who[1] for who in self.heard if who[0] in rule.sources})
+            listed = f"entities seen: {', '.join(seen[:_MOST_LISTED]) or 'none'}"
+            listed += f" and {more} more" if (more := len(seen) - _MOST_LISTED) > 0 else ""
+            fitting = [who for who in self.heard if who[0] in rule.sources and rule.takes(who)]
+            if not rule.sources:
+                yield rule.name, "the recording is outside of its hours"
+            elif not fitting:
+                yield rule.name, f"{listed}; none matches {' '.join(rule.entities)}"
+            elif isinstance(rule.condition, Near | Count):
+                away, entity = min(
+                    (rule.condition.distance(*point), who[1])
+                    for who in fitting
+                    for point in self.tracks[who]
+                )
+                limits = f"start: {rule.condition.start:g}, dwell: {rule.dwell}"
+                yield rule.name, f"nearest: {entity} at {away:,.0f} m ({limits})"
+            else:
+                yield rule.name, f"{listed}; its condition never held for {rule.dwell}"
 
 
 def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
@@ -270,6 +296,7 @@ def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
     for observation in bag.observations():
         waiting.append(observation)
         replay.messages += 1
+        replay.heard.add(observation.who)
         if observation.position is not None:
             track = replay.tracks.setdefault(observation.who, [])
             if not track or dist(track[-1], observation.position) >= _TRACK_M:
@@ -300,7 +327,8 @@ def show(replay: Replay, output: str) -> None:
         f"{replay.span[1] - replay.span[0]:.1f} s; events that have not stopped: "
         f"{len(replay.lasting)}"
     )
-    formats.show(output, as_data(replay), [Table(columns, rows), summary])
+    silent = [f"rule '{rule}' had no event: {why}" for rule, why in replay.without_events()]
+    formats.show(output, as_data(replay), [Table(columns, rows), *silent, summary])
     for (topic, why), count in replay.left_out.items():
         lost = " is" if topic == REST_OF_BAG else f": {count} messages are"
         errors.print(f"warning: {topic}{lost} left out: {why}")
@@ -331,6 +359,7 @@ def as_data(replay: Replay) -> dict[str, Any]:
             }
             for event, goal in replay.events
         ],
+        "without_events": [{"rule": rule, "reason": why} for rule, why in replay.without_events()],
         "lasting": [
             {"rule": rule, "entities": list(subjects)} for rule, subjects in replay.lasting
         ],

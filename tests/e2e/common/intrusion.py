@@ -16,7 +16,6 @@ NEIGHBOUR = "neighbour"  # a namespace that belongs to no access domain
 FOLDER = "clusters/c-its/perception"
 FILE, BASE = f"{FOLDER}/edge/foreign.yaml", f"{FOLDER}/foreign/kustomization.yaml"
 ELSEWHERE = "elsewhere"  # a folder that is not the domain's
-_RBAC = "rbac.authorization.k8s.io"
 _BY_POLICY = " is not possible with podSecurity: host-network of access domain 'perception'"
 _PODS = yaml.safe_load(Path(__file__).with_name("pods.yaml").read_text())
 
@@ -53,13 +52,6 @@ def makers(spec: Manifest) -> Iterator[Manifest]:
 
 def config(name: str, namespace: str) -> Manifest:
     return build_manifest("v1", "ConfigMap", name, namespace, data={"made": "by hand"})
-
-
-def binding(kind: str, namespace: str = "") -> Manifest:
-    """Return a binding of this kind that makes the domain's account an administrator."""
-    account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
-    role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
-    return build_manifest(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])
 
 
 def withdraw(world: World) -> None:

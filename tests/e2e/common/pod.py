@@ -20,7 +20,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tests.e2e.rig import launch
+from tests.e2e.rig import ENDS_WITH_US
 from tests.e2e.rig.kube import Kube, Manifest
 
 from .volumes import files
@@ -80,7 +80,7 @@ class Pod:
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(
                 [
-                    *launch.command("/usr/bin/unshare", "--mount", "--propagation", "private"),
+                    *(*ENDS_WITH_US, "/usr/bin/unshare", "--mount", "--propagation", "private"),
                     *("/bin/sh", "-eu", str(_START), str(root), image, " ".join(sorted(folders))),
                     *(sys.executable, " ".join(mounts), *ids, *variables, *command),
                 ],

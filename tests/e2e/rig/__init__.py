@@ -7,3 +7,10 @@ imports nothing, so that a Python without packages can build the programs.
 
 class RigError(RuntimeError):
     """Raised when the rig cannot build, start or reach something; it says how to mend it."""
+
+
+ENDS_WITH_US = ("setpriv", "--pdeathsig", "KILL")
+"""Before a command: the kernel kills the program when the process that started it has ended.
+
+Else a test run that is ended by `kill -9` would leave a cluster behind.
+"""

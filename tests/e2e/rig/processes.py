@@ -18,7 +18,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from . import RigError, launch
+from . import ENDS_WITH_US, RigError
 from .net import Probe
 
 _POLL_SECONDS = 0.05
@@ -129,7 +129,7 @@ class Processes:
             log.flush()
             # the kernel also kills the process when this thread ends: start no rig in another
             self._running[name] = subprocess.Popen(
-                launch.command(*component.argv),
+                [*ENDS_WITH_US, *component.argv],
                 env={**self._environment, **component.environment},
                 cwd=self._logs,
                 stdin=subprocess.DEVNULL,

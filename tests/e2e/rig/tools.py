@@ -32,7 +32,7 @@ from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from . import RigError, launch
+from . import ENDS_WITH_US, RigError
 
 WRAPPERS = Path(__file__).resolve().parent.parent / "tools"
 CACHE_VARIABLE = "DEMANDOPS_E2E_CACHE"
@@ -218,7 +218,7 @@ def _go(folder: Path, own: dict[str, str], *arguments: str) -> str:
     dropped = {"GOOS", "GOARCH", "GOEXPERIMENT", "GO111MODULE"}
     kept = {key: value for key, value in os.environ.items() if key not in dropped}
     done = subprocess.run(
-        launch.command(shutil.which("go") or "go", *arguments, niceness=19),
+        [*ENDS_WITH_US, "nice", "-n", "19", "go", *arguments],
         cwd=folder,
         env=kept | settings | own,
         stdin=subprocess.DEVNULL,

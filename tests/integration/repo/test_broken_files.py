@@ -9,7 +9,6 @@ import subprocess
 from contextlib import suppress
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import pygit2
 import pytest
@@ -23,7 +22,7 @@ from demandops.repo.load import snapshot as snapshots
 from demandops.serve.generator import Generator
 from pygit2 import Oid
 
-from tests.kit import rig
+from tests.kit import plain_yaml, rig
 from tests.kit.chance import IN_FULL
 from tests.kit.config import override
 from tests.kit.memory import NOW
@@ -31,7 +30,8 @@ from tests.kit.repo import FORGER, GitRepo, differing
 from tests.kit.repo import read as text
 from tests.kit.rig import Person, goal, leave
 
-NODES, IMAGES = "inventory/nodes.yaml", "registry/images.yaml"
+TABLES = plain_yaml.beside(__file__)
+CLUSTERS, NODES, IMAGES = "inventory/clusters.yaml", "inventory/nodes.yaml", "registry/images.yaml"
 DETECTION = "clusters/c-its/perception/edge/od-edge-station00.yaml"
 TWO = override({"services": ["object-detection"], "nodes": ["edge"]}, replicas=2)
 BROKEN = override({"services": ["object-fusion"], "nodes": ["edge"]}, replicas="many")
@@ -50,31 +50,14 @@ def tagged(bare: Path, new: str, kind: str = "Images") -> str:
     return yaml.safe_dump(images)
 
 
-def effects() -> list[dict[str, Any]]:
-    """Return the fields of overrides, each with another effect; one is not valid."""
-    fusion, links = {"services": ["object-fusion"]}, {"connections": ["*"]}
-    detection = {"services": ["object-detection"]}
-    return [
-        {"select": fusion, "hold": True, "priority": 5},
-        {"select": {"applications": ["edge/*"], "requesters": ["user1", "user5"]}, "keep": True},
-        {"select": links, "keep": True},
-        {"select": {"requesters": ["user2"]}, "deny": True},
-        {"select": detection, "deny": True},
-        {"select": {"nodes": ["edge"]}, "values": {"tolerations": []}},
-        {"select": {"applications": ["edge/fusion-2"]}, "node": "cloud", "priority": 7},
-        {"select": links, "images": {"mqtt-client": {"tag": "t"}}, "priority": 9},
-        {"select": detection, "replicas": "many"},
-    ]
-
-
 def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
     """Return a random change that is valid, breaks a file, or removes what demands need."""
     start, end = nodes.index("  - id: vehicle01\n"), nodes.index("  - id: vehicle02\n")
     claim = random.choice([path for path in rig.claims(bare) if "applications" in path])
-    number, fields = random.choice([*enumerate(effects())])
-    name, select = f"overrides/{number}.yaml", fields.pop("select")
+    number, fields = random.choice([*enumerate(TABLES["overrides"])])
+    name = f"overrides/{number}.yaml"
     changes: list[dict[str, str | None]] = [
-        {name: override(select, **fields)},
+        {name: override(**fields)},
         {name: None} if text(bare, name) else {"README.md": "Ours\n"},
         {IMAGES: tagged(bare, f"v{random.randint(1, 9)}")},
         {IMAGES: tagged(bare, "v1", "Imags")},
@@ -91,75 +74,17 @@ def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
     return {**chosen, "notes.md": str(random.random())}
 
 
-STYLES: dict[str, list[str]] = {
-    "merge": ["checkout -q main", "merge -q --no-ff -m Merge BRANCH"],
-    "fast-forward": ["checkout -q main", "merge -q --ff-only BRANCH"],
-    "squash": ["checkout -q main", "merge -q --squash BRANCH", "commit -q -m Squash"],
-    "rebase": ["checkout -q main", "cherry-pick main..BRANCH"],
-    # main becomes the second parent, as after a `git pull` on the branch
-    "the other way round": [
-        "checkout -q BRANCH",
-        "merge -q --no-ff -m Pull main",
-        "branch -q -f main BRANCH",
-        "checkout -q main",
-    ],
-}
-
-
-@pytest.mark.parametrize("style", STYLES)
-def test_a_merge_of_any_style_is_judged_and_so_is_a_second_one_of_the_same_branch(
-    bare: Path, person: Person, style: str
-) -> None:
-    def merge(text: str, *, number: int) -> None:
-        person.fetch()
-        folder = person.folder
-        # the second time on the same branch, where the forge's way of merging allows that
-        start = "main~1" if number == 1 and style != "fast-forward" else "main"
-        if number == 1 or style in ("squash", "rebase", "fast-forward"):
-            rig.git(folder, "branch", "-f", "topic", start)
-        rig.git(folder, "checkout", "-q", "topic")
-        (folder / "overrides" / "topic.yaml").write_text(text)
-        rig.git(folder, "add", "overrides")
-        rig.git(folder, "commit", "-q", "-m", "The topic")
-        for command in STYLES[style]:
-            rig.git(folder, *command.replace("BRANCH", "topic").split())
-        rig.git(folder, "push", "-q", "origin", "main")
-
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1), goal(2))
-        merge(BROKEN, number=1)
-        rig.book(generator, goal(3))
-        assert {each.file for each in generator.snapshot.problems} == {"overrides/topic.yaml"}
-    with rig.running(bare) as generator:
-        rig.book(generator, leave(1))
-        assert generator.snapshot.problems
-        merge(BROKEN.replace("many", "5"), number=2)
-        rig.book(generator, goal(4))
-        assert generator.snapshot.problems == ()
-    assert differing(bare) == {}
-
-
-CLUSTERS = "inventory/clusters.yaml"
-MISTAKES: dict[str, list[tuple[str, str, str]]] = {
-    "a later commit changed the same file": [
-        (CLUSTERS, "kind: Clusters", "kind: X"),
-        (CLUSTERS, "kind: X", "# Petra\nkind: X"),
-    ],
-    "the file at fault refers to the one that changed": [(CLUSTERS, "c-its", "c-ity")],
-}
-
-
-@pytest.mark.parametrize("mistakes", MISTAKES.values(), ids=MISTAKES)
+@pytest.mark.parametrize("mistakes", TABLES["mistakes"].values(), ids=TABLES["mistakes"])
 @pytest.mark.parametrize("how", ["push", "pull"])
 def test_the_printed_revert_mends_main(
-    generator: Generator, bare: Path, person: Person, how: str, mistakes: list[tuple[str, str, str]]
+    generator: Generator, bare: Path, person: Person, how: str, mistakes: list[list[str]]
 ) -> None:
     person.change({CLUSTERS: f"# Earlier, and valid\n{text(bare, CLUSTERS)}"})
     rig.book(generator, goal(1))
     before = text(bare, CLUSTERS)
     person.fetch()
-    for path, old, new in mistakes:
-        file = person.folder / path
+    file = person.folder / CLUSTERS
+    for old, new in mistakes:
         file.write_text(file.read_text().replace(old, new))
         rig.git(person.folder, "commit", "-q", "-a", "-m", "A mistake")
     if how == "pull":
@@ -247,23 +172,6 @@ def test_a_start_at_any_commit_finds_what_the_running_generator_has(
     rig.assert_sound(bare)
 
 
-FOREIGN = [
-    "100644 bootstrap/evil.yml",
-    "100644 clusters/c-its/evil.json",
-    "100755 clusters/c-its/perception/edge/Kustomization",
-    "120000 clusters/c-its/perception/link.yaml",
-    "120000 clusters/README.md",
-    "160000 clusters/submodule",
-    '100644 "clusters/c-its/\\377.yaml"',
-    '100644 "clusters/\\377\\\\/evil.yaml"',
-    "100644 clusters/" + "deep/" * 3000 + "evil.yaml",
-    "100644 ledger/" + "deep/" * 3000 + "evil.yaml",
-    '100644 "inventory/\\377/\\377.yaml"',
-    "100644 policy/" + "deep/" * 3000 + "evil.yaml",
-]
-"""Entries that a state repo should not have: mode and path, as ``git fast-import`` reads them."""
-
-
 def test_what_does_not_belong_in_generated_folders_is_removed_whatever_it_is_called(
     generator: Generator, bare: Path
 ) -> None:
@@ -282,8 +190,8 @@ def test_what_does_not_belong_in_generated_folders_is_removed_whatever_it_is_cal
         "M 100644 inline clusters/a/README.md",
         "data 2\na\n",
     ]
-    for line in FOREIGN:
-        mode, _, path = line.partition(" ")
+    for line in TABLES["foreign"]:
+        mode, _, path = line.replace("DEEP", "deep/" * 3000).partition(" ")
         what = "1" * 40 if mode == "160000" else "inline"
         lines += [f"M {mode} {what} {path}", *(["data 5\nevil\n"] if what == "inline" else [])]
     text = "\n".join(lines).encode()

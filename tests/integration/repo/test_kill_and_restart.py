@@ -1,12 +1,14 @@
-"""After a kill at any time and a restart, each acknowledged demand is booked, and counts once."""
+"""What a killed process leaves is carried on, given up or told, and counts once.
+
+``tests/faults`` kills a generator at each system call of a demand, and ``tests/simulation`` several
+machines in the middle of a history.
+"""
 
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable
 from pathlib import Path
-from random import Random
 
 import pytest
 from demandops.cli import state_repo
@@ -16,74 +18,9 @@ from demandops.serve.journal import DamagedJournal
 
 from tests.kit import rig
 from tests.kit.cli import Run
-from tests.kit.rig import Drivers, Told, demand, goal
+from tests.kit.rig import Drivers, demand, goal
 
 pytestmark = pytest.mark.synced
-
-KILLS = 15
-LANES = 4
-
-
-def _client(lane: int) -> list[tuple[str, rig.Goal]]:
-    """Return a client's demands in order; of every three joins, two are followed by a leave."""
-    made = []
-    for turn in range(60):
-        number = lane + turn * LANES
-        made.append((f"join-{number}", goal(number)))
-        if turn % 3:
-            made.append((f"leave-{number}", goal(number, shutdown=True)))
-    return made
-
-
-@pytest.mark.parametrize("seed", [20260301])
-def test_killed_at_random_moments_loses_and_doubles_nothing(
-    drivers: Drivers, address: str, bare: Path, seed: int
-) -> None:
-    random = Random(f"{address.partition('://')[0]} {seed}")
-    clients = [_client(lane) for lane in range(LANES)]
-    acknowledged: dict[str, str] = {}
-    sent: list[str] = []
-    for turn in range(KILLS + 1):
-        last = turn == KILLS
-        lanes = []
-        for client in clients:
-            open_ = [(name, made) for name, made in client if name not in acknowledged]
-            if last:  # finish the begun demands, and a few more
-                open_ = open_[:2]
-            # what has no answer yet is sent again, with a new operation id
-            lanes.append([demand(name, made, f"op-{name}-try{turn}") for name, made in open_])
-        run = drivers.start(address, lanes)
-        delay = random.choice([random.uniform(0, 0.03), random.uniform(0.03, 0.16)])
-        killer = threading.Timer(delay, run.kill)
-        told = run.listen(on_ready=(lambda: None) if last else killer.start)
-        _note(told, sent, acknowledged)
-        sent += [name for name in told.sent if name not in sent]
-    assert told.finished is True, "the last run, which nobody kills, must end by itself"
-
-    rig.assert_sound(bare)
-    made = {name: wanted for client in clients for name, wanted in client}
-    in_history = [
-        f"{'leave' if commit.one('Operation') == 'shutdown' else 'join'}-"
-        f"{commit.one('Request-Id').removeprefix('demand-')}"
-        for commit in rig.commits(bare)
-    ]
-    assert sorted(in_history) == sorted(acknowledged), (
-        "each acknowledged demand must have one commit"
-    )
-    for name, commit in acknowledged.items():
-        if commit:
-            rig.git(bare, "merge-base", "--is-ancestor", commit, "main")
-        assert name in in_history
-    assert rig.books(bare) == rig.books_after(made[name] for name in acknowledged)
-
-
-def _note(told: Told, sent: list[str], acknowledged: dict[str, str]) -> None:
-    for name, answer in told.answers.items():
-        # a repeated release may find that its first sending was carried out
-        again = name in sent and "nothing that the shutdown lists is held" in answer["text"]
-        assert answer["outcome"] in ("booked", "released", "unchanged") or again, answer
-        acknowledged[name] = answer["commit"]
-
 
 # ---- what was released stays released ----
 
@@ -232,7 +169,7 @@ def test_two_processes_have_slots_of_their_own_and_a_dead_ones_journal_is_adopte
 ) -> None:
     with rig.running(url) as first:
         # a second process is killed beside the first, with a demand in its journal
-        told = drivers.start(url, [[demand("join-1", goal(1))]], dies=True).listen()
+        told = rig.listen(drivers.start(url, [[demand("join-1", goal(1))]], dies=True))
         assert told.finished is None
         slots = sorted(path.name for path in next(data_home.iterdir()).iterdir())
         assert slots == ["slot-0", "slot-1"]
@@ -254,7 +191,7 @@ def test_the_journal_of_one_state_repo_is_never_played_into_another(
     for folder in (here, there):
         folder.mkdir()
         new_repo(f"{folder.name}/state.git")
-    drivers.start("state.git", [[demand("join-1", goal(1))]], cwd=here, dies=True).listen()
+    rig.listen(drivers.start("state.git", [[demand("join-1", goal(1))]], cwd=here, dies=True))
     assert rig.restart(there / "state.git") is True
     assert rig.operations(there / "state.git") == []
     # the journal is found again however the folder is named

@@ -70,7 +70,7 @@ def test_two_processes_on_one_machine_lose_and_double_nothing(
     drivers: Drivers, bare: Path, data_home: Path
 ) -> None:
     sent = lanes(generators=2, demands=32)
-    told = rig.listen_to_all(drivers, [drivers.start(bare, each) for each in sent])
+    told = rig.listen_to_all([drivers.start(bare, each) for each in sent])
     assert {path.name for path in next(data_home.iterdir()).iterdir()} == {"slot-0", "slot-1"}
     assert_one_would_have_done_the_same(bare, sent, told, [])
 
@@ -119,7 +119,7 @@ def test_many_writers_end_where_one_would(
             server.faults.cuts = lambda: dice.random() < CUTS
 
         try:
-            told = rig.listen_to_all(drivers, runs, begin_to_cut)
+            told = rig.listen_to_all(runs, begin_to_cut)
         finally:
             over.set()
         took = time.monotonic() - started

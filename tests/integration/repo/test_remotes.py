@@ -19,10 +19,12 @@ from demandops.repo.git.repository import MAIN, PushDenied
 from demandops.serve import approvals
 from demandops.serve.generator import Generator
 
-from tests.kit import goals, rig
+from tests.kit import goals, plain_yaml, rig
 from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server
 from tests.kit.rig import NOW, Person, Proposed, Stages, goal
+
+TABLES = plain_yaml.beside(__file__)
 
 # ---- away and back ----
 
@@ -54,38 +56,17 @@ def test_a_server_that_cannot_store_a_push_now_is_waited_for(
     rig.assert_sound(bare)
 
 
-@pytest.mark.parametrize(
-    ("server", "told"),
-    [
-        (["git@edge: Permission denied (publickey)"], "; git needs credentials"),
-        (  # the server ends in the middle of its answer, and git complains of that last
-            [
-                "warning: unable to access 'config': Input/output error",
-                "fatal: unknown error occurred while reading the configuration files",
-            ],
-            "$",
-        ),
-        (  # the server could not read the reference from its disk, and names a null id
-            [f"fatal: git upload-pack: not our ref {'0' * 40}"],
-            "; the server cannot read the branch",
-        ),
-        (
-            ["fatal: detected dubious ownership in repository at '/srv/state.git'"],
-            "; .* who owns the repository's files",
-        ),
-    ],
-    ids=["credentials", "cut off", "no reference", "owner"],
-)
+@pytest.mark.parametrize(("says", "told"), TABLES["unreadable"].values(), ids=TABLES["unreadable"])
 def test_a_remote_that_cannot_be_read_is_told_with_its_reason(
-    server: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    says: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The message leaves out git's last lines, which are the same whatever the reason is."""
-    ssh, words = tmp_path / "ssh", "\n".join(server)
-    begun = "printf '000eversion 2\\n'\n" if len(server) > 1 else ""
+    ssh, words = tmp_path / "ssh", "\n".join(says)
+    begun = "printf '000eversion 2\\n'\n" if len(says) > 1 else ""
     ssh.write_text(f'#!/bin/sh\n{begun}echo "{words}" >&2\nexit 255\n')
     ssh.chmod(0o755)
     monkeypatch.setenv("GIT_SSH_COMMAND", str(ssh))
-    reason = f"^ssh://edge/state.git cannot be fetched: {re.escape(server[0])}{told}"
+    reason = f"^ssh://edge/state.git cannot be fetched: {re.escape(says[0])}{told}"
     with pytest.raises(StateRepoError, match=reason):
         Generator("ssh://git@edge/state.git")
 
@@ -139,18 +120,8 @@ def test_people_may_push_while_it_is_found_out_which_commit_is_refused(
 
 # ---- every commit is refused: the writer is ----
 
-FRAME = "remote: \\nremote: ====\\nremote: \\nremote: {}\\nremote: \\nremote: ====\\nremote: "
 
-
-@pytest.mark.parametrize(
-    ("says", "told"),
-    [
-        ("ERROR: This repository was archived so it is read-only.", "archived"),
-        (FRAME.format("ERROR: This deploy key has no write access."), "ERROR: This deploy key has"),
-        ("Gitea: User: 3:bot with Key: 5 is not authorized.\\nPlease ask.", "authorized. Please"),
-        ("Unauthorized", "Unauthorized"),
-    ],
-)
+@pytest.mark.parametrize(("says", "told"), TABLES["refusals"])
 def test_a_writer_that_is_refused_is_told_the_servers_words(
     ssh: Path, bare: Path, monkeypatch: pytest.MonkeyPatch, says: str, told: str
 ) -> None:
@@ -210,10 +181,7 @@ def test_a_proposal_that_the_server_does_not_take_waits_for_a_bounded_time(
 # ---- nobody is refused ----
 
 
-@pytest.mark.parametrize(
-    ("after", "seconds"),
-    [("retry-after: 7", 7.0), ("Retry-After: 86400", 300.0), ("Retry-After: soon", 0.0)],
-)
+@pytest.mark.parametrize(("after", "seconds"), TABLES["rate limits"])
 def test_a_rate_limit_is_an_absence_that_says_how_long_it_lasts(after: str, seconds: float) -> None:
     sent = "12:00:00.1 http.c:684 => Send header: GET /s.git/info/refs HTTP/2\n"
     http = f"{sent}<= Recv header: HTTP/2 429\n<= Recv header: {after}\n"
@@ -222,25 +190,13 @@ def test_a_rate_limit_is_an_absence_that_says_how_long_it_lasts(after: str, seco
     assert limited.retry_after_s == seconds
 
 
-@pytest.mark.parametrize(
-    ("line", "took", "told"),
-    [
-        (" \t1f:refs/heads/main\ta1..1f", True, ("", "")),
-        ("*\t1f:refs/pull/7/head\t[new reference]", False, ("", "")),  # a merge request instead
-        ("!\t1f:refs/heads/main\t[rejected] (stale info)", False, ("[rejected]", "stale info")),
-        (
-            "!\t1f:refs/heads/main\t[remote rejected] (no (not now))",
-            False,
-            ("[remote rejected]", "no (not now)"),
-        ),
-    ],
-)
+@pytest.mark.parametrize(("line", "took", "told"), TABLES["lines of a push"])
 def test_what_came_of_a_push_is_read_from_the_line_of_its_branch(
-    line: str, took: bool, told: tuple[str, str]
+    line: str, took: bool, told: list[str]
 ) -> None:
     result = GitResult(int(line[0] == "!"), f"To there\n{line}\nDone\n", "")
     assert result.took(MAIN) is took
-    assert result.line_of(MAIN) == told
+    assert [*result.line_of(MAIN)] == told
     assert result.is_verdict(MAIN) is (told[0] == "[remote rejected]")
 
 

@@ -13,6 +13,9 @@ from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import VIEWS, Shown
 from tests.integration.web.html import Page
+from tests.kit import plain_yaml
+
+ASKED = plain_yaml.beside(__file__)
 
 
 @pytest.fixture
@@ -74,38 +77,18 @@ def test_another_name_of_this_machine_is_refused(client: TestClient) -> None:
     assert client.get("/", headers={"Host": "localhost:8080"}).status_code == 200
 
 
-LINK = {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
-ELSEWHERE = {
-    "origin": {"Origin": "https://attacker.example"},
-    "origin-of-another-port": {"Origin": "http://127.0.0.1:3000"},
-    "no-origin": {"Origin": "null"},
-    "fetch": {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"},
-    "another-port": {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "cors"},
-    "frame": {"Sec-Fetch-Site": "cross-site", **LINK, "Sec-Fetch-Dest": "iframe"},
-    "prefetch": {"Sec-Fetch-Site": "cross-site", **LINK, "Sec-Purpose": "prefetch;prerender"},
-    "unknown": {"Sec-Fetch-Site": "x"},
-}
-HERE = {
-    "program": {},
-    "typed": {"Sec-Fetch-Site": "none", **LINK},
-    "link-elsewhere": {"Sec-Fetch-Site": "cross-site", **LINK},
-    "this-page": {"Sec-Fetch-Site": "same-origin", "Sec-Fetch-Mode": "cors"},
-    "this-page-by-a-proxy": {"Sec-Fetch-Site": "same-origin", "Origin": "https://fleet.example"},
-    "old-browser": {"Origin": "http://127.0.0.1:8080"},
-}
-
-
-@pytest.mark.parametrize("case", ELSEWHERE)
+@pytest.mark.parametrize("case", ASKED["elsewhere"])
 def test_what_another_site_makes_a_browser_ask_is_refused(client: TestClient, case: str) -> None:
     for path in ("/", "/services?at=HEAD", "/events", "/health", "/static/page.js"):
-        refused = client.get(path, headers=ELSEWHERE[case])
+        refused = client.get(path, headers=ASKED["elsewhere"][case])
         assert refused.status_code == 403
         assert "default-src 'none'" in refused.headers["Content-Security-Policy"]
 
 
 def test_what_the_page_or_its_visitor_asks_is_answered(client: TestClient) -> None:
-    answers = {case: client.get("/", headers=HERE[case]).status_code for case in HERE}
-    assert answers == dict.fromkeys(HERE, 200)
+    here = ASKED["here"]
+    answers = {case: client.get("/", headers=here[case]).status_code for case in here}
+    assert answers == dict.fromkeys(here, 200)
 
 
 def test_an_address_that_others_reach_is_warned_of(

@@ -67,7 +67,7 @@ def test_a_branch_is_no_command_and_hides_nothing(
     page = look("/proposals")
     (approve,) = [text for text in page.texts("code") if " approve " in text]
     assert shlex.split(approve) == wanted
-    assert approve.replace(" approve ", " reject ") in page.texts("code")
+    assert f"{approve.replace(' approve ', ' reject ')} -m REASON" in page.texts("code")
     (approve,) = [text for text in look("/").texts("code") if " approve " in text]
     assert shlex.split(approve) == wanted
     assert HIDDEN not in page.text + look("/").text

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from demandops.cluster.health import Health
-
-from tests.kit import plain_yaml
 
 Case = dict[str, Any]
 """A row of a table in YAML: the objects in a cluster, and the health that they must give."""
@@ -39,12 +36,6 @@ def deployment(name: str, *conditions: Any, of: str = "", **status: Any) -> dict
     whole = {"observedGeneration": 3, "updatedReplicas": 2, "availableReplicas": 2}
     found = whole | status | {"conditions": list(conditions)}
     return {"metadata": metadata, "spec": {"replicas": 2}, "status": found}
-
-
-def read_cases(module: str, name: str) -> dict[str, list[Case]]:
-    """Return the tables of a YAML file beside a test module."""
-    tables: dict[str, list[Case]] = plain_yaml.load(Path(module).with_name(name).read_text())
-    return tables
 
 
 def deployments(case: Case) -> dict[tuple[str, str, str], dict[str, Any]]:

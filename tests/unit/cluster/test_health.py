@@ -17,10 +17,11 @@ from demandops.cluster.health import (
     worst,
 )
 
-from tests.unit.cluster.cases import Case, Letters, condition, deployments, read_cases, told
+from tests.kit import plain_yaml
+from tests.unit.cluster.cases import Case, Letters, condition, deployments, told
 
 COMMITS = Letters()
-ARGOCD_CASES, FLUX_CASES = (read_cases(__file__, f"{name}.yaml") for name in ("argocd", "flux"))
+ARGOCD_CASES, FLUX_CASES = (plain_yaml.beside(__file__, name) for name in ("argocd", "flux"))
 PLACE = ClusterDomain("c-its", "perception", "ns")
 
 

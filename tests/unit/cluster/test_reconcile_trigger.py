@@ -24,7 +24,7 @@ from tests.kit.http import Answer, Server, kubeconfig, serving
 from tests.kit.limits import PATIENCE_S
 from tests.kit.rig import wait_until
 
-TABLES = plain_yaml.load(Path(__file__).with_name("clusters.yaml").read_text())
+TABLES = plain_yaml.beside(__file__, "clusters")
 SOURCED = {"sourceRef": {"name": "demandops"}}
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 

@@ -1,11 +1,15 @@
-"""When clients restart, and what is never rendered for them.
+"""When clients restart, what is never rendered for them, and what their programs declare.
 
 ``tests/scenarios/clients-carry-what-is-demanded.yaml`` and ``tests/golden`` have what they carry.
+The repo in memory takes no configuration with a field that its schema lacks, so the schemas are
+compared with ``declared.yaml``.
 """
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from operator import itemgetter
 from typing import Any
@@ -13,12 +17,10 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.errors import Refused
-from demandops.base.naming import Subject, SubjectKind
-from demandops.connections.connection import ClientKey, Route
-from demandops.connections.zenoh import ZENOH
-from demandops.decide.planning.planner import affected_keys
+from demandops.base.settings import data_folder
+from demandops.connections import connection_types
+from demandops.connections.connection import Route
 from demandops.decide.state import State, rendered_files
-from demandops.model.ledger.ledger import changes_on
 
 from tests.kit import plain_yaml
 from tests.kit.config import skeleton
@@ -72,18 +74,6 @@ def test_a_further_topic_restarts_who_cannot_read_it_and_a_further_requester_nob
     assert sum(one != before[1][name] for name, one in configurations(repo).items()) == 2
 
 
-def test_both_nodes_of_a_connection_are_affected_and_no_other() -> None:
-    repo = MemoryRepo(state=state(vehicle00=SPEAKS, vehicle01=SPEAKS, edge=REACHABLE))
-    before = repo.state
-    for number, id in enumerate("dc"):
-        repo.send(
-            routes(demand("zenoh", {f"/{id}": f"/{id}"}, id=id, source=f"vehicle0{1 - number}"))
-        )
-    changes = changes_on(before.ledger, repo.state.ledger, [Subject(SubjectKind.CONNECTION, "c")])
-    keys = affected_keys(before, repo.state, changes)
-    assert keys == (ClientKey(ZENOH, "vehicle00"), ClientKey(ZENOH, "edge"))
-
-
 def test_no_two_connections_share_an_mqtt_topic_or_a_client_id() -> None:
     repo = MemoryRepo()
     ids = ("c", "c/d", "c_d", "C", "c-source", "c/source", "+", "#", "$SYS/x", "a/+/b", "/", "//")
@@ -131,3 +121,44 @@ def test_what_people_change_in_git_so_that_the_type_cannot_carry_it_is_told(
         rendered_files(replace(state(**(NODES | case.get("lost", {}))), ledger=ledger))
     found = refused.value.faults[0]
     assert (found.field, found.message[: len(case["told"])]) == (case["field"], case["told"])
+
+
+# ---- what the clients' programs declare ----
+
+DECLARED = plain_yaml.beside(__file__, "declared")
+TYPES = {"string": "str", "integer": "int", "boolean": "bool", "number": "float"}
+
+
+def leaves(schema: Any, definitions: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """Yield (path, name of the Python type) for each value that a schema allows."""
+    if "$ref" in schema:
+        schema = definitions[schema["$ref"].rpartition("/")[2]]
+    if schema.get("type") == "array":
+        items = schema["items"]
+        for item in items if isinstance(items, list) else [items]:
+            yield from leaves(item, definitions, f"{path}[]")
+    elif schema.get("type") == "object":
+        assert schema["additionalProperties"] is False, path
+        patterns = [("{}", part) for part in schema.get("patternProperties", {}).values()]
+        for name, part in (*schema.get("properties", {}).items(), *patterns):
+            yield from leaves(part, definitions, f"{path}.{name}" if path else name)
+    else:
+        values = schema.get("enum", [schema.get("const")])
+        yield path, TYPES[schema["type"]] if "type" in schema else type(values[0]).__name__
+
+
+@pytest.mark.parametrize("program", DECLARED, ids=lambda one: f"{one['program']} {one['version']}")
+def test_a_program_declares_all_that_its_clients_are_told(program: dict[str, Any]) -> None:
+    file = data_folder("templates") / "connections" / program["type"] / "schema.json"
+    schema = json.loads(file.read_text())
+    prefix = "/**/*.ros__parameters."  # for all nodes of a ROS program
+    told = {
+        (path.removeprefix(prefix), name) for path, name in leaves(schema, schema["definitions"])
+    }
+    assert len(told) > 5
+    assert told - {*program["reads"].items()} == set()
+
+
+def test_there_is_a_program_for_each_connection_type() -> None:
+    words = {known.word for known in connection_types.CONNECTION_TYPES}
+    assert {program["type"] for program in DECLARED} == words

@@ -1,10 +1,11 @@
-"""One demand causes a bounded amount of work, however it is made.
+"""A demand causes a bounded amount of work, however it is made, and so does a merged file.
 
 Work is counted in calls of functions and in looks at the clock, so the tests need no clock.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -13,11 +14,13 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import OverBudget, Refused
+from demandops.base.errors import Fault, InvalidInput, OverBudget, Refused
 from demandops.decide.decision import decide
 from demandops.decide.placement.placement import MOST_ATTEMPTS
+from demandops.model.config.load import load
 
-from tests.kit.config import override, skeleton
+from tests.kit import plain_yaml
+from tests.kit.config import configuration, override, skeleton
 from tests.kit.goals import Goal, application, connection, goal, perception
 from tests.kit.memory import MemoryRepo
 
@@ -164,14 +167,6 @@ LARGE = {
 
 @pytest.mark.parametrize("name", LARGE)
 def test_the_clock_is_looked_at_again_before_much_is_done(name: str) -> None:
-    books = repo(4, demandItems=2_000)
-    books.decide(demand([app(0)], [link(0)]))  # templates are compiled once
-    _, longest, _ = work_of(books, LARGE[name])
-    assert longest < 600_000, "about a tenth of a second"
-
-
-@pytest.mark.parametrize("name", LARGE)
-def test_a_demand_that_takes_too_long_is_refused_and_nothing_else(name: str) -> None:
     books, looks = repo(4, demandItems=2_000), 0
 
     def checkpoint() -> None:
@@ -180,6 +175,9 @@ def test_a_demand_that_takes_too_long_is_refused_and_nothing_else(name: str) -> 
         if looks > 3:
             raise OverBudget("too long")
 
+    books.decide(demand([app(0)], [link(0)]))  # templates are compiled once
+    _, longest, _ = work_of(books, LARGE[name])
+    assert longest < 600_000, "about a tenth of a second"
     with pytest.raises(Refused) as refusal:
         decide(books.state, LARGE[name], books.now, books.files.get, checkpoint=checkpoint)
     assert "too-large" in codes(refusal.value)
@@ -245,3 +243,52 @@ def test_the_work_grows_with_the_demand_and_not_faster(made: Callable[[int], Goa
     for held in (False, True):
         once = work(400, held=held)
         assert work(800, held=held) < 2.5 * once
+
+
+# ---- merged files with thousands of entries ----
+
+MANY = plain_yaml.beside(__file__, "many-entries")
+
+
+def files_of(kind: str, count: int) -> dict[str, str]:
+    """Return the files with ``count`` entries of each form of a case."""
+    files = dict[str, str]()
+    for path, document in MANY[kind].items():
+        if "{}" in path:
+            files |= {
+                numbered(path, number): override(*one.pop("select"), **one)
+                for number, one in enumerate(numbered(document, n) for n in range(count))
+            }
+        else:
+            entries = {
+                field: [numbered(one[0], number) for number in range(count)]
+                for field, one in document.items()
+                if isinstance(one, list)
+            }
+            files[path] = yaml.safe_dump({"apiVersion": "demandops/v1"} | document | entries)
+    return files
+
+
+def numbered(entry: Any, number: int) -> Any:
+    text = json.dumps(entry).replace(' "{}"', f" {number}")
+    return json.loads(text.replace("{}", f"{number:04}"))
+
+
+def work_of_loading(files: dict[str, str]) -> tuple[int, tuple[Fault, ...]]:
+    calls, whole = [0], configuration(files)
+    with counted(calls):
+        try:
+            load(whole)
+        except InvalidInput as invalid:
+            return calls[0], invalid.faults
+    return calls[0], ()
+
+
+@pytest.mark.parametrize("kind", MANY)
+def test_the_work_to_load_files_grows_with_their_entries_and_not_faster(kind: str) -> None:
+    work_of_loading({})  # what is read once for all
+    none, _ = work_of_loading({})
+    few, _ = work_of_loading(files_of(kind, 200))
+    many, faults = work_of_loading(files_of(kind, 800))
+    assert many - none < 6 * (few - none), "four times as many entries"
+    assert len(faults) < 4 * 800

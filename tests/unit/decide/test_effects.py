@@ -1,46 +1,17 @@
-"""Whether the pods of a release start, restart, take over new values, or stop."""
+"""What an override does to the pods of a release; a scenario shows what a demand does."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import pytest
-import yaml
-from demandops.decide.state import ReleaseChange, describe_change, planned_releases
-from demandops.render import gitops
+from demandops.decide.state import describe_change, planned_releases
 
-from tests.kit.config import edited, override, skeleton
+from tests.kit.config import override
+from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
-APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 FUSION = "of-edge-fusion-c9b035cdedb8"
-
-
-def demand(vehicle: str) -> dict[str, Any]:
-    topic = {"topic": f"/vehicles/{vehicle}/ego_data", "source": vehicle}
-    app = {"id": "edge/fusion", "type": "object-detection-fusion", "node": "edge"}
-    app |= {"inputs": {"ego_data": [topic]}}
-    return {"kind": "Demand", "demand": vehicle, "requesters": [vehicle], "applications": [app]}
-
-
-def effects(repo: MemoryRepo, goal: object) -> dict[str, str]:
-    return {each.name: each.effect for each in repo.send(goal).releases}
-
-
-@pytest.mark.parametrize("gitops", ["flux", "argocd"])
-def test_an_input_reconfigures_a_service_that_takes_it_over(gitops: str) -> None:
-    files = {path: text for path, text in skeleton(gitops).items() if path == "demandops.yaml"}
-    live, cold = MemoryRepo(files), MemoryRepo(files | edited(APPDEF, "    live: [inputs]\n", ""))
-    for repo in (live, cold):
-        assert effects(repo, demand("vehicle00"))[FUSION] == "starts"
-    assert effects(live, demand("vehicle01"))[FUSION] == "reconfigures"
-    assert effects(cold, demand("vehicle01"))[FUSION] == "restarts"
-    ended = {"kind": "Demand", "operation": "release"}
-    gone = [
-        effects(live, ended | {"demand": vehicle, "requesters": [vehicle]})
-        for vehicle in ("vehicle00", "vehicle01")
-    ]
-    assert (gone[0][FUSION], {*gone[1].values()}) == ("reconfigures", {"stops"})
 
 
 @pytest.mark.parametrize(
@@ -57,31 +28,11 @@ def test_an_override_has_the_effect_of_what_it_changes(
     changed: dict[str, Any], effect: str
 ) -> None:
     text = override({"services": ["object-fusion"]}, **changed)
-    before, after = MemoryRepo(), MemoryRepo({"overrides/test.yaml": text})
-    for repo in (before, after):
-        repo.send(demand("vehicle00"))
-    assert change_between(before, after).effect == effect
-
-
-def change_between(before: MemoryRepo, after: MemoryRepo) -> ReleaseChange:
-    def of(repo: MemoryRepo) -> tuple[Any, str]:
-        (path,) = (path for path in repo.files if path.endswith(f"/{FUSION}.yaml"))
+    sides = list[tuple[Any, str]]()
+    for repo in (MemoryRepo(), MemoryRepo({"overrides/test.yaml": text})):
+        repo.send(put("fusion"))
         by_name = {release.name: release for release in planned_releases(repo.state).values()}
-        return by_name[FUSION], repo.files[path]
-
-    (was, current), (now, text) = of(before), of(after)
-    return describe_change(was, now, current, text)
-
-
-@pytest.mark.parametrize("gitops_controller", ["flux", "argocd"])
-def test_values_are_read_from_a_text_as_yaml_has_them(gitops_controller: str) -> None:
-    repo = MemoryRepo({"demandops.yaml": skeleton(gitops_controller)["demandops.yaml"]})
-    repo.send(demand("vehicle00"))
-    texts = [text for path, text in repo.files.items() if f"/{FUSION}.yaml" in path]
-    values, rest = gitops.values_apart(texts[0])
-    spec = yaml.safe_load(texts[0])["spec"]
-    written = spec.get("values") or spec["source"]["helm"]["valuesObject"]
-    assert {
-        name: yaml.safe_load(f"{name}:{text}")[name] for name, text in values.items()
-    } == written
-    assert not values.keys() & {*rest.split()}
+        (path,) = (path for path in repo.files if path.endswith(f"/{FUSION}.yaml"))
+        sides.append((by_name[FUSION], repo.files[path]))
+    (was, current), (now, written) = sides
+    assert describe_change(was, now, current, written).effect == effect

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import patches_commute
 from tests.kit.memory import MemoryRepo
 
 CONFIG = MemoryRepo().config
@@ -30,23 +29,6 @@ json = st.recursive(
 )
 _text = partial(dumps, sort_keys=True)
 patch = st.fixed_dictionaries({}, optional={"k": json, "l": json})
-
-
-# what a chart has below the values: nothing, some defaults, or it is not known
-below = st.none() | patch
-
-
-@given(patch, patch, patch, below)
-@examples(60)
-def test_patches_that_commute_give_the_same_in_either_order(
-    target: dict[str, Any], one: dict[str, Any], other: dict[str, Any], below: dict[str, Any] | None
-) -> None:
-    both = (
-        overridden(overridden(target, one, below), other, below),
-        overridden(overridden(target, other, below), one, below),
-    )
-    if patches_commute(one, other):
-        assert _text(both[0]) == _text(both[1])
 
 
 @given(json, patch)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from datetime import datetime
 from operator import itemgetter
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,8 +15,7 @@ from tests.kit import plain_yaml
 from tests.kit.detection import POSE, SOURCES, Run, at, demand, file_of, rule
 
 EVENTS, DEMANDS, BOOKED = (
-    plain_yaml.load(Path(__file__).with_name(f"{name}.yaml").read_text())
-    for name in ("events", "wanted_demands", "booked_demands")
+    plain_yaml.beside(__file__, name) for name in ("events", "wanted_demands", "booked_demands")
 )
 NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
 LEVELS = {"start": 2, "stop": 1}

@@ -11,10 +11,8 @@ from typing import Any
 
 import pytest
 from demandops.base.errors import Refused
-from demandops.connections.connection import Connection, ConnectionType, Route
+from demandops.connections.connection import Connection, Route
 from demandops.connections.mqtt import MQTT
-from demandops.connections.ros import ROS
-from demandops.connections.zenoh import ZENOH
 from demandops.decide.booking import apply
 from demandops.model.demand.demand import UNSTARTED, Demand, Item, Lease
 from demandops.model.ledger import claim as claim_files
@@ -59,20 +57,6 @@ def test_a_reverse_route_delivers_to_the_source() -> None:
     assert ledger.ids_with("brings", "t", "/b")
     assert ledger.ids_with("brings", "s", "/c")
     assert not ledger.ids_with("brings", "t", "/d")
-
-
-@pytest.mark.parametrize("kind", [ZENOH, ROS])
-def test_links_are_known_at_both_nodes_as_long_as_somebody_holds_them(kind: ConnectionType) -> None:
-    ledger = joined(joined(Ledger(), type=kind), "w", type=kind)
-    ledger = joined(ledger, type=kind, id="d", target="u")
-
-    def known(ledger: Ledger) -> list[tuple[str, ...]]:
-        return [ledger.ids_with("link", kind.name, node) for node in "stu"]
-
-    assert known(ledger) == [("c", "d"), ("c",), ("d",)]
-    for claim, at_target in zip(ledger.connection_claims("c"), [("c",), ()], strict=True):
-        ledger = ledger.replace(claim.key, None)
-        assert known(ledger) == [(*at_target, "d"), at_target, ("d",)]
 
 
 def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:

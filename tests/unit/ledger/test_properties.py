@@ -10,32 +10,26 @@ from dataclasses import replace
 from datetime import timedelta
 from random import Random
 
+from demandops.decide.booking import Restoration
 from demandops.decide.decision import Decision
 from demandops.decide.state import rendered_files
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import ClaimKey, demand_id
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples, told
 from tests.kit.memory import MemoryRepo, ledger_in, outcome
-from tests.model.books import Books, Demand, Result
+from tests.model.books import Books, Result
 from tests.model.goals import SKELETON, Maker, shutdown_of
 from tests.model.listed import Goal, Topic
-from tests.model.view import view
-
-Key = tuple[tuple[str, str], str]
-"""A claim's key: its subject and its demand id."""
-
-
-def key_of(subject: tuple[str, str], demand: Demand) -> Key:
-    """Return the key that the program's claim must have for a claim of the model."""
-    return subject, demand_id(*demand) if demand[1] else demand[0]
-
-
-def key_from(key: ClaimKey) -> Key:
-    """Convert the program's key of a claim."""
-    return (key.subject.kind.value.removesuffix("s"), key.subject.id), key.demand
+from tests.model.view import (
+    claims_in_ledger,
+    claims_of,
+    in_model_words,
+    key_in_ledger,
+    key_of,
+    view,
+)
 
 
 class Walk:
@@ -50,11 +44,8 @@ class Walk:
         expected = self._books.take(request)
         taken = self._repo.take(request)
         assert outcome(taken) == expected.outcome, (expected, taken)
-        claims = {
-            key_of(*key): ({*claim.topics}, claim.who) for key, claim in self._books.claims.items()
-        }
-        assert self._claims() == claims, request
-        assert self._repo.view() == view(self._books)
+        assert claims_in_ledger(self._repo.state.ledger) == claims_of(self._books), request
+        assert in_model_words(self._repo.bookkeeping()) == view(self._books)
         if isinstance(taken, Decision):
             assert_changes(taken, expected)
             self._assert_counts_once(request)
@@ -65,12 +56,6 @@ class Walk:
         assert fresh.ledger == self._repo.state.ledger
         at_once = rendered_files(fresh)
         assert self._repo.below(*{path.split("/")[0] for path in at_once}) == at_once
-
-    def _claims(self) -> dict[Key, tuple[set[tuple[str, ...]], tuple[str, ...]]]:
-        return {
-            key_from(claim.key): ({*claim.held.topic_keys()}, claim.requesters)
-            for claim in self._repo.state.ledger
-        }
 
     def _assert_counts_once(self, request: Goal) -> None:
         again = request if "kind" in request else self.maker.again(request)
@@ -83,8 +68,8 @@ class Walk:
 
 def assert_changes(taken: Decision, expected: Result) -> None:
     """Check that exactly the touched claims are written, and that each missing hold is named."""
-    changed = {key_from(change.key) for change in taken.changes.claims}
-    assert changed == {key_of(*key) for key in expected.touched}
+    changed = {key_in_ledger(change.key) for change in taken.changes.claims}
+    assert changed == {key_of(key) for key in expected.touched}
     paths = {claim_files.path_of(change.key) for change in taken.changes.claims}
     assert {path for path in taken.files if claim_files.kind_of(path)} == paths
     assert bool(taken.files) == bool(expected.touched)
@@ -100,11 +85,6 @@ def _names(text: str, subject: str, topic: Topic | None, who: tuple[str, ...]) -
     words = " ".join(("topic", *topic) if len(topic) == 1 else topic[:2]) if topic else ""
     named = f": {words} " in text if topic else ": " not in text
     return named and f"'{subject}'" in text and text.endswith(f" for {', '.join(who)}")
-
-
-def assert_same(one: MemoryRepo, other: MemoryRepo) -> None:
-    assert one.state == other.state
-    assert one.files == other.files
 
 
 @examples(25)
@@ -125,29 +105,6 @@ def often(requests: list[Goal], random: Random) -> list[Goal]:
 
 
 @examples(10)
-@given(chances, st.integers(0, 6), st.integers(0, 6))
-def test_a_released_demand_leaves_no_trace(random: Random, before: int, after: int) -> None:
-    maker = Maker(random)
-    first = maker.sequence(before)
-    maker.calm = True
-    guest = Maker(random, calm=True).join("guest", ["visitor"])
-    others = [
-        maker.leave() if maker.joined and random.randrange(2) else maker.join()
-        for _ in range(after)
-    ]
-    told([*first, guest, *others])
-    with_guest, without = MemoryRepo(), MemoryRepo()
-
-    assert with_guest.take_all(first) == without.take_all(first)
-    (came,) = with_guest.take_all([guest])
-    assert with_guest.take_all(others) == without.take_all(others)
-    (left,) = with_guest.take_all([shutdown_of(guest)])
-
-    assert (came, left) in (("booked", "released"), ("refused", "refused"))
-    assert_same(with_guest, without)
-
-
-@examples(10)
 @given(chances, st.integers(1, 8))
 def test_when_all_have_left_the_repo_is_as_it_was_laid_down(random: Random, count: int) -> None:
     maker, repo = Maker(random, calm=True), MemoryRepo()
@@ -155,48 +112,19 @@ def test_when_all_have_left_the_repo_is_as_it_was_laid_down(random: Random, coun
     repo.take_all(often(requests, random))
     ends = often([shutdown_of(request) for request in requests], random)
     assert {*repo.take_all(ends)} <= {"released", "refused"}, "who has left may say so again"
-    assert_same(repo, MemoryRepo())
+    assert (repo.state, repo.files) == (MemoryRepo().state, MemoryRepo().files)
 
 
-@examples(8)
-@given(chances, st.integers(2, 6))
-def test_the_order_of_independent_demands_does_not_matter(random: Random, count: int) -> None:
-    maker = Maker(random, calm=True)
-    joins = [maker.join(f"request {number}") for number in range(count)]
-    leaves = [shutdown_of(request) for request in joins[: random.randrange(count)]]
-    one_order = told([*joins, *leaves, *(maker.join() for _ in range(count))])
-    other_order: list[Goal] = []
-    waiting = random.sample(one_order, len(one_order))
-    while waiting:  # a shutdown must come after its join
-        here = {request["id"] for request in other_order}
-        ready = [r for r in waiting if not r["shutdown"] or r["id"] in here]
-        other_order.append(ready[0])
-        waiting.remove(ready[0])
-    one, other = MemoryRepo(), MemoryRepo()
-
-    assert "refused" not in {outcome(one.take(request)) for request in one_order}
-    for request in other_order:  # the order inside a request does not matter either
-        assert outcome(other.take(maker.again(request))) != "refused"
-    assert_same(one, other)
-
-
-@examples(14)
-@given(chances, st.integers(1, 8))
-def test_a_further_requester_changes_no_release(random: Random, length: int) -> None:
-    maker, repo = Maker(random), MemoryRepo()
-    requests = told(maker.sequence(length))
-    standing = [request for request in requests if outcome(repo.take(request)) == "booked"]
-    assume(standing)
-    same = maker.again(standing[-1])
-    for app in same["apps"]:
-        app["object_detection_fusion_app"]["requester_ids"].append("onlooker")
-    for item in same["connections"]:
-        item["requester_ids"].append("onlooker")
-    told([same])
-    assume(outcome(repo.take(standing[-1])) == "unchanged")
-
-    decision = repo.send(same)
-
-    assert decision.outcome == "booked"
-    assert not decision.releases
-    assert not [path for path in decision.files if not path.startswith("ledger/")]
+@examples(9)
+@given(chances, st.integers(0, 12), st.integers(0, 12))
+def test_a_rollback_gives_the_books_and_files_of_then(
+    random: Random, before: int, after: int
+) -> None:
+    repo = MemoryRepo()
+    repo.take_all(told(Maker(random, calm=True).sequence(before)))
+    then, files = repo.state.ledger, dict(repo.files)
+    repo.take_all(told(Maker(random).sequence(after)))
+    back = Restoration(id="back", to="0" * 40, claims=tuple(then), drop_newer=True)
+    decision = repo.send(back)
+    assert (repo.state.ledger.claims, repo.files) == (then.claims, files)
+    assert decision.outcome == ("restored" if decision.files else "unchanged")

@@ -1,13 +1,10 @@
-"""The ledger counts requesters as the reference's operators do.
-
-A recorded run of the operators shows that the model of the operators is right, and where DemandOps
-differs from them.
-"""
+"""The ledger counts requesters as the reference's operators do, of whom a run is recorded."""
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from datetime import timedelta
 from itertools import permutations
 from pathlib import Path
@@ -19,11 +16,8 @@ from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.ledger import Ledger
 
 from tests.kit import plain_yaml
-from tests.kit.goals import (
-    EXPERIMENT,
-)
+from tests.kit.goals import EXPERIMENT
 from tests.kit.memory import NOW, MemoryRepo
-from tests.model.operators import Operators
 
 ROOT = Path(__file__).parents[3]
 RUN = plain_yaml.load((ROOT / "tests" / "fixtures" / "reference-run.yaml").read_text())
@@ -38,7 +32,7 @@ def resource(kind: str, *ids: str) -> str:
 
 
 def counted(ledger: Ledger) -> Books:
-    """Return the requesters of each resource of the reference, as :meth:`Operators.books` does.
+    """Return the sorted requesters of each resource of the reference, of a fusion for each topic.
 
     A requester is listed once for each of its claims on the resource.
     """
@@ -82,52 +76,35 @@ def running(repo: MemoryRepo) -> Books:
     return {name: sorted(topics) for name, topics in runs.items()}
 
 
-class Recorded:
-    """One of the two tables of the recorded run: ``books`` (who requests what) or ``runs``.
+def recorded(name: str) -> Iterator[Books]:
+    """Yield a table that DemandOps must have after each step of the recorded run.
 
-    ``theirs`` is the table of the reference after a step, and ``ours`` is the table that DemandOps
-    must have after the step. The record of a step lists only changes: changed entries of
-    ``theirs``, and entries of ``ours`` that begin or cease to differ from ``theirs``.
+    ``name`` is ``books`` (who requests what) or ``runs``. The record of a step lists only changes:
+    changed entries of the reference's table, and entries that begin or cease to differ here.
     """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self.theirs: Books = {}
-        self._differs: dict[str, Any] = {}
-
-    def follow(self, step: dict[str, Any]) -> None:
-        self.theirs = present(self.theirs | step.get(self._name, {}))
-        differs = self._differs | step.get(f"{self._name}_here", {})
-        self._differs = {name: what for name, what in differs.items() if what != "same"}
-        for name, what in self._differs.items():
-            assert what != self.theirs.get(name), f"{name} does not differ here"
-
-    @property
-    def ours(self) -> Books:
-        return present(self.theirs | self._differs)
+    theirs, differs = dict[str, list[str]](), dict[str, Any]()
+    for step in RUN["steps"]:
+        theirs = present(theirs | step.get(name, {}))
+        differs |= step.get(f"{name}_here", {})
+        differs = {entry: what for entry, what in differs.items() if what != "same"}
+        for entry, what in differs.items():
+            assert what != theirs.get(entry), f"{entry} does not differ here"
+        yield present(theirs | differs)
 
 
 def present(books: dict[str, Any]) -> Books:
     return {name: what for name, what in books.items() if what is not None}
 
 
-def test_a_recorded_run_of_the_reference_is_what_the_model_says_and_what_comes_of_it_here() -> None:
-    operators, repo = Operators(), MemoryRepo()
-    books, runs = Recorded("books"), Recorded("runs")
-    for number, step in enumerate(RUN["steps"], 1):
+def test_what_comes_of_a_recorded_run_of_the_reference_here() -> None:
+    repo, both = MemoryRepo(), zip(recorded("books"), recorded("runs"), strict=True)
+    for number, (step, (books, runs)) in enumerate(zip(RUN["steps"], both, strict=True), 1):
         wanted = step["goal"]
         if isinstance(wanted, str):
             wanted = plain_yaml.load((ROOT / wanted).read_text())
-        books.follow(step)
-        runs.follow(step)
-
-        reasons = operators.take(wanted)
         repo.take(wanted, NOW + timedelta(minutes=2 * number))
-
-        assert operators.books() == books.theirs, number
-        assert reasons <= {step.get("class"), "never-ran"}, number
-        assert counted(repo.state.ledger) == books.ours, number
-        assert running(repo) == runs.ours, number
+        assert counted(repo.state.ledger) == books, number
+        assert running(repo) == runs, number
 
 
 def test_the_recorded_run_shows_every_difference_that_the_page_explains() -> None:
@@ -137,23 +114,40 @@ def test_the_recorded_run_shows_every_difference_that_the_page_explains() -> Non
     assert sorted(explained) == sorted({step["class"] for step in RUN["steps"] if "class" in step})
 
 
-def test_the_papers_table_is_the_operators_in_all_orders_of_joining_and_leaving() -> None:
+def test_the_papers_table_counts_each_join_in_all_orders_of_joining_and_leaving() -> None:
     """After all joins the ledgers are equal, so one of them stands for all before the leaves."""
+    config = MemoryRepo().config
+
+    def after(ledger: Ledger, goal: dict[str, Any]) -> Ledger:
+        return apply(ledger, with_definitions(read_goal(goal), config), NOW)[0]
+
     goals = [plain_yaml.load(file.read_text()) for file in EXPERIMENT]
-    config, starts, ends = MemoryRepo().config, [Ledger()], list[Ledger]()
-    before = list[Any]()
+    alone = {who_asks(goal): counted(after(Ledger(), goal)) for goal in goals[:4]}
+    whole, standing = Ledger(), dict[str, Books]()
     for part in (goals[:4], goals[4:]):
         ends = []
         for order in permutations(part):
-            ledger, operators = starts[0], Operators()
-            for each in before:
-                operators.take(each)
-            for each in order:
-                assert not operators.take(each)
-                request = with_definitions(read_goal(each), config)
-                ledger, _ = apply(ledger, request, NOW)
-                assert counted(ledger) == operators.books()
+            ledger, held = whole, dict(standing)
+            for goal in order:
+                ledger, who = after(ledger, goal), who_asks(goal)
+                if goal["shutdown"]:
+                    del held[who]
+                else:
+                    held[who] = alone[who]
+                assert counted(ledger) == united(held.values())
             ends.append(ledger)
         assert all(one.claims == ends[0].claims for one in ends)
-        starts, before = ends, [*before, *part]
-    assert not len(ends[0])
+        whole, standing = ends[0], held
+    assert not len(whole)
+
+
+def who_asks(goal: dict[str, Any]) -> str:
+    return " ".join(goal["apps"][0]["object_detection_fusion_app"]["requester_ids"])
+
+
+def united(books: Iterable[Books]) -> Books:
+    found = defaultdict[str, list[str]](list)
+    for each in books:
+        for name, who in each.items():
+            found[name] += who
+    return {name: sorted(who) for name, who in found.items()}

@@ -20,10 +20,9 @@ from tests.kit.config import configuration, edited, skeleton
 
 ROOT, NODES = "demandops.yaml", "inventory/nodes.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
-V1 = "- id: vehicle01\n"
 Files = Mapping[str, str | None]
 
-_LISTED = plain_yaml.load(Path(__file__).with_name("config-mistakes.yaml").read_text())
+_LISTED = plain_yaml.beside(__file__, "config-mistakes")
 _EXAMPLES = Path(__file__).parents[3] / "examples"
 _OF_A_CLUSTER = {
     "appdefs/map-server/service.yaml": (_EXAMPLES / "map-server" / "service.yaml").read_text()
@@ -85,21 +84,6 @@ def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
     for path in NEEDED:
         (found,) = refused({path: content})
         assert found.file == path
-
-
-@pytest.mark.parametrize("id", ["vehicle/01", "vehicle 01", "é", "x" * 64, "-a"])
-def test_an_id_that_is_no_label_needs_a_selector(id: str) -> None:
-    """Without a selector, a release selects ``node_id: <id>``, which must be a valid label."""
-    (found,) = refused(edited(NODES, V1, f'- id: "{id}"\n'))
-    assert found.file == NODES
-    assert "selector" in str(found)
-    load(configuration(edited(NODES, V1, f'- id: "{id}"\n    selector: {{a: b}}\n')))
-
-
-@pytest.mark.parametrize("topic", ["ego", "x y", "~/ego", "/a//b", "/é"])
-def test_a_usual_topic_that_ros_forbids_is_refused(topic: str) -> None:
-    (found,) = refused(edited(NODES, "/vehicles/vehicle00/ego_data", f'"{topic}"'))
-    assert (found.file, found.field) == (NODES, "nodes[0].topics.ego_data")
 
 
 @pytest.mark.parametrize("name", _LISTED["valid"])

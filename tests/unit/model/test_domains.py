@@ -12,6 +12,7 @@ import yaml
 from demandops.model.config.load import load
 
 from tests.kit.config import configuration, edited, skeleton
+from tests.kit.connections import demand, routes
 from tests.kit.memory import MemoryRepo
 from tests.unit.model.test_config_mistakes import changed
 
@@ -103,8 +104,7 @@ def test_the_list_of_the_documentation_is_taken() -> None:
 def secrets(files: dict[str, Any]) -> dict[str, list[tuple[str, list[str]]]]:
     """Return the secrets and keys that the clients of a connection between two domains get."""
     books = MemoryRepo(changed({"base": "two domains"} | files))
-    link = {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
-    books.send({"kind": "Demand", "demand": "d", "requesters": ["v"], "connections": [link]})
+    books.send(routes(demand()))
     pods = [item["spec"]["template"]["spec"] for item in books.objects("Deployment").values()]
     return {
         pod["nodeSelector"]["node_id"]: [

@@ -31,11 +31,11 @@ GOALS = dict(
 )
 PROBES = ("startupProbe", "readinessProbe", "livenessProbe")
 FREE = {
-    *("OverrideFile.values", "Parameter.default", "Application.parameters"),
+    *("OverrideFile.values", "Parameter.default", "Application.parameters", "Discovery.entry"),
     *(f"{kind}ClientSettings.{probe}" for kind in ("", "Mqtt") for probe in PROBES),
 }
 FREE_PLACES = (
-    *("values", "parameters.rate.default"),
+    *("values", "parameters.rate.default", "parameters.size.oneOf"),
     *(f"{kind}.{probe}" for kind in ("mqtt", "zenoh", "ros") for probe in PROBES),
 )
 

@@ -1,12 +1,8 @@
-"""What ``demandops check`` warns of in a valid configuration.
-
-``policy-warnings.yaml`` and ``request-warnings.yaml`` list it.
-"""
+"""What is warned of in a valid configuration and in a demand; YAML files list it."""
 
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,11 +11,14 @@ from demandops.model.config.load import load
 
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, state_of
+from tests.kit.connections import demand, routes
+from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 from tests.unit.model.test_config_mistakes import APPDEF, changed
 
-CASES = plain_yaml.load(Path(__file__).with_name("policy-warnings.yaml").read_text())
-REQUESTS = plain_yaml.load(Path(__file__).with_name("request-warnings.yaml").read_text())
+CASES = plain_yaml.beside(__file__, "policy-warnings")
+MISSPELLED = plain_yaml.beside(__file__, "misspelled-topics")
+REQUESTS = plain_yaml.beside(__file__, "request-warnings")
 
 
 def told(case: dict[str, Any]) -> list[str]:
@@ -46,12 +45,42 @@ def test_requests_that_no_node_or_pod_has_are_told(name: str) -> None:
         assert words in one
 
 
+@pytest.mark.parametrize(("live", "changes", "words"), plain_yaml.beside(__file__, "live-warnings"))
+def test_a_live_value_that_does_not_exist_is_told(
+    live: str, changes: dict[str, Any], words: list[str]
+) -> None:
+    state = MemoryRepo(changed({**changes, APPDEF: {"live: [inputs]": f"live: [{live}]"}})).state
+    told = [*map(str, warnings.live_warnings(state))]
+    assert len(told) == bool(words)
+    for text in told:
+        assert text.startswith(f"{APPDEF}: services.object-fusion.live: ")
+        assert all(word in text for word in words), text
+
+
 def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
     books = MemoryRepo(changed({"base": "two domains"}))
-    link = {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
-    books.send({"kind": "Demand", "demand": "d", "requesters": ["v"], "connections": [link]})
+    books.send(routes(demand()))
     closed = {"base": "two domains", "policy/access-domains.yaml": {"peers: [": "nodes: ["}}
     config = load(configuration(changed(closed)))
     found = map(str, warnings.policy_warnings(state_of(config, books.state.ledger)))
     (told,) = [one for one in found if "no rule of access domain 'fleet' has 'city' among" in one]
     assert told.endswith("claims on such connections stay in effect: 1")
+
+
+@pytest.mark.parametrize("role", ["point_cloud", "ego_data", ""])
+@pytest.mark.parametrize(("source", "topic", "known", "meant"), MISSPELLED)
+def test_a_topic_is_told_if_it_is_probably_a_misspelling_of_a_known_one(
+    source: str, topic: str, known: list[str], meant: str, role: str
+) -> None:
+    """As an input of an application, and on a connection alone."""
+    books = MemoryRepo()
+    for number, one in enumerate([*known, topic]):
+        link = {"id": f"c{number}", "source": source, "target": "edge", "topics": [{"source": one}]}
+        demand = put(f"d{number}", applications=[], connections=[link])
+        if role:
+            demand = put(f"d{number}")
+            demand["applications"][0]["inputs"] = {role: [{"topic": one, "source": source}]}
+        decision = books.send(demand)
+    told = f"'{source}' is not known to publish {topic}; did you mean '{meant}'?"
+    warned = [text for text in decision.warnings if "did you mean" in text]
+    assert [told in text for text in warned] == [True] * bool(meant)

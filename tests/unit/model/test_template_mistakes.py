@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,11 +17,12 @@ from tests.kit.http import serving
 from tests.kit.memory import MemoryRepo
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
+APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 CHART = "appdefs/object-detection-fusion/charts/object-detection"
 SCHEMA = f"{CHART}/values.schema.json"
 LAST = skeleton()[TEMPLATE].count("\n") + 1
 """The number of the line that is appended to the template."""
-LISTED = plain_yaml.load(Path(__file__).with_name("template-mistakes.yaml").read_text())
+LISTED = plain_yaml.beside(__file__, "template-mistakes")
 
 
 def refused(changed: dict[str, str]) -> list[str]:
@@ -82,6 +82,13 @@ def test_every_value_that_does_not_fit_the_charts_schema_is_told() -> None:
     assert all(one.endswith(f"; fix the template or {CHART}") for one in found)
     places = sorted(one.split(": ")[1] for one in found)
     assert places == ["values.hostNetwork", "values.replicas"]
+
+
+def test_a_value_that_comes_from_a_parameter_names_it() -> None:
+    text = skeleton()[APPDEF].replace("\nservices:", "\nparameters: {net: {default: x}}\nservices:")
+    template = skeleton()[TEMPLATE].replace("{{ node.host_network }}", "{{ parameters.net }}")
+    (found,) = refused({TEMPLATE: template, APPDEF: text})
+    assert found.endswith(f"{CHART}, or demand another value of the parameter net")
 
 
 @pytest.mark.parametrize(("text", "above", "word"), LISTED["topics"])

@@ -10,11 +10,14 @@ import pytest
 from demandops.base.errors import fault
 from demandops.decide.decision import Decision
 from demandops.decide.state import ReleaseChange
+from demandops.model.config.load import load
 from demandops.model.demand.demand import Decommission
 from demandops.repo.history import commit_message
 
 from tests.kit import goals
-from tests.unit.decide.test_room import put, release, waiting_repo
+from tests.kit.config import state_of
+from tests.kit.memory import MemoryRepo
+from tests.scenarios.running import configuration
 from tests.unit.repo.conftest import NOW, Desk
 
 FILE = Path(__file__).with_name("commit-messages.txt")
@@ -41,6 +44,12 @@ def messages() -> Iterator[tuple[str, str]]:
     desk = Desk(now=NOW)
     desk.join("vehicle00")
     yield "a shutdown that lists what was not held", text(desk.send(goal))
+    some = goals.application("edge/fusion", clouds=[("/stations/station00/rear", "station00")])
+    desk = Desk(now=NOW)
+    desk.join("vehicle00")
+    desk.join("vehicle00", cloud="/stations/station00/rear")
+    goal = goals.goal([some], [], id="intersection", shutdown=True)
+    yield "a shutdown of a topic", text(desk.send(goal))
     releases = [ReleaseChange("of-edge", "object-fusion on edge", "", "change", ("- replicas 1",))]
     problems = [fault("nodes[0].id", "appears twice; remove one").within("inventory/nodes.yaml")]
     ids, how = ("c" * 40, "b" * 40), "correct the files, or undo the commits: git revert cccc"
@@ -52,15 +61,35 @@ def messages() -> Iterator[tuple[str, str]]:
     yield "a commit that puts a claim back", put_back
     long = Desk(now=NOW).join("vehicle00", application="edge/" + "fusion" * 40)
     yield "a long id", text(long).split("\n")[0]
-    repo = waiting_repo()
-    for number in range(4):
-        taken = repo.take(put(f"d{number}", 4))
-    gone = Decommission(id="solo", kinds=frozenset({"requester"}))
-    for goal in (put("d4", 4, requesters=["solo"]), gone, release("d3"), None):
-        assert isinstance(taken, Decision)
-        yield "a demand that waits", commit_message.of_decision(taken, "op", repo.now)
-        if goal is not None:
-            taken = repo.take(goal)
+    full = MemoryRepo(state=state_of(load(configuration(config=FULL))))
+    release = {"kind": "Demand", "operation": "release", "demand": "d1", "requesters": ["v"]}
+    for wanted in (
+        waiting("d1", "v"),
+        waiting("d2", "solo"),
+        Decommission(id="solo", kinds=frozenset({"requester"})),
+        release,
+    ):
+        yield "a demand that waits", commit_message.of_decision(full.send(wanted), "op", full.now)
+
+
+FULL = {
+    "inventory/nodes.yaml": {
+        "nodes": [{"id": "edge", "type": "edge", "cluster": "c-its", "capacity": {"cpu": 1}}]
+    },
+    "inventory/brokers.yaml": {"brokers": []},
+    "policy/access-domains.yaml": {
+        "domains": [{"name": "all", "namespace": "all", "whenFull": "wait"}]
+    },
+    "appdefs/object-detection-fusion/appdef.yaml": {
+        "services": {"object-fusion": {"requests": {"cpu": 2}}}
+    },
+}
+
+
+def waiting(demand: str, who: str) -> goals.Goal:
+    made = goals.put(demand, who, topic=("/ego", "edge"), node="")
+    made["applications"][0]["place"] = {"role": "edge"}
+    return made
 
 
 def listing() -> str:

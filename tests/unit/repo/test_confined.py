@@ -34,7 +34,7 @@ def confine(code: str, *arguments: str, seconds: int = 60) -> subprocess.Complet
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-SAID = plain_yaml.load(Path(__file__).with_name("helm-says.yaml").read_text())
+SAID = plain_yaml.beside(__file__, "helm-says")
 Ran = Callable[[str], Report]
 FETCH = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout=5)"
 

@@ -50,7 +50,7 @@ class Replay:
         return Answer.json(answer["body"], answer["status"], **answer.get("headers", {}))
 
 
-TABLES = plain_yaml.load(Path(__file__).with_name("forges.yaml").read_text())
+TABLES = plain_yaml.beside(__file__, "forges")
 BRANCH = "demand/one-0123456789ab"
 LINKS = {
     "github": "https://github.com/its/state/pull/7",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import pygit2
@@ -20,7 +19,7 @@ from tests.kit import plain_yaml
 from tests.kit.chance import examples, visible
 from tests.kit.repo import git
 
-TEXTS = plain_yaml.load(Path(__file__).with_name("texts.yaml").read_text())
+TEXTS = plain_yaml.beside(__file__, "texts")
 HOSTILE = [*TEXTS["hostile"], "\ud800", "\ud83d\ude97", "x" * 100_000]
 FORGES, ORDERS = TEXTS["forges"], TEXTS["orders"]
 VALUES = st.one_of(

@@ -15,7 +15,7 @@ from demandops.repo.git.repository import RemoteAway
 from tests.kit import plain_yaml
 from tests.kit.repo import git
 
-ADDRESSES = plain_yaml.load(Path(__file__).with_name("addresses.yaml").read_text())
+ADDRESSES = plain_yaml.beside(__file__, "addresses")
 TOKENS = [  # each as the user's name; the sixth is one of Gitea, the last of Azure DevOps
     f"ghp_{'secret1' * 5}@github.com",
     f"github_pat_{'secret1' * 9}@github.com",

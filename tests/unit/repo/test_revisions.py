@@ -23,7 +23,7 @@ MAIN = "refs/heads/main"
 ROS_BRIDGE = Path(__file__).parents[3] / "ros_bridge"
 WHO = pygit2.Signature("a", "a@example.org", 0, 0)
 NOW = datetime(2026, 1, 31, 12, 0, 30, tzinfo=timezone.utc)
-TABLES = plain_yaml.load(Path(__file__).with_name("revisions.yaml").read_text())
+TABLES = plain_yaml.beside(__file__, "revisions")
 
 
 @pytest.mark.parametrize("text", TABLES["times"])
@@ -223,10 +223,13 @@ def test_where_a_release_is_or_once_was(tmp_path: Path) -> None:
     assert commit_log.release_path(history.repo, gone, "r") == PATH
     assert commit_log.release_path(history.repo, gone, "q") is None
     assert commit_log.release_path(history.repo, gone, "*") is None
-    assert commit_log.stopped_releases(history.repo, gone) == {str(gone): ["r"]}
+    assert commit_log.removed_files(history.repo, gone, commit_log.RELEASE_FILES) == {
+        str(gone): {"r": PATH}
+    }
     history.commit("a", 1, path="clusters/c/d/_charts/detection-0.1.0.yaml")
     without_chart = history.commit(None, 2)
-    assert commit_log.stopped_releases(history.repo, without_chart) == {str(gone): ["r"]}
+    removed = commit_log.removed_files(history.repo, without_chart, commit_log.RELEASE_FILES)
+    assert removed == {str(gone): {"r": PATH}}
 
 
 def test_a_clock_that_was_set_back_hides_no_commit_and_shows_no_known_one(tmp_path: Path) -> None:

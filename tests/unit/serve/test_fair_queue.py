@@ -46,17 +46,6 @@ def test_requesters_take_turns() -> None:
     assert order(*many, ticket("b0 y"), ticket("c0 z"))[:5] == ["a0", "b0", "c0", "a1", "a2"]
 
 
-@pytest.mark.parametrize(
-    ("came", "left"),
-    [
-        ("a0 x0, a1 x1, a2 x2 shared, b0 shared", "a0 a2 a1 b0"),  # b0 must follow a2
-        ("a0 x, a1 y, all, b0 z", "a0 a1 all b0"),
-    ],
-)
-def test_nothing_overtakes_what_it_must_follow(came: str, left: str) -> None:
-    assert order(*map(ticket, came.split(", "))) == left.split()
-
-
 def test_what_must_keep_its_order_keeps_it() -> None:
     shared = (reference("a0", "x", "a"), reference("a1", "y", "a", "b"), reference("b0", "y", "b"))
     assert order(*shared) == ["a0", "a1", "b0"], "the last two goals share a connection"

@@ -27,7 +27,7 @@ from tests.unit.templating import write
 
 APPDEF = Path(__file__).parents[3] / "appdefs" / "object-detection-fusion"
 CHARTS = ("object-detection", "object-fusion")
-CHANGES = plain_yaml.load(Path(__file__).with_name("chart-values.yaml").read_text())
+CHANGES = plain_yaml.beside(__file__, "chart-values")
 
 
 def chart_values(chart: str) -> dict[str, Any]:

@@ -27,7 +27,6 @@ from tests.kit.memory import MemoryRepo
 
 FOLDER = "appdefs/object-detection-fusion"
 TEMPLATE = f"{FOLDER}/values/object-detection.yaml.j2"
-HERE = Path(__file__).parent
 ENDLESS = "{% for a in range(9999) %}" * 3 + "{% endfor %}" * 3
 SECONDS = 0.1
 """How long an evaluation may take here, so that what never ends costs little."""
@@ -45,7 +44,7 @@ def shared() -> Evaluator:
     return Evaluator()
 
 
-@pytest.mark.parametrize("text", plain_yaml.load((HERE / "endless.yaml").read_text()))
+@pytest.mark.parametrize("text", plain_yaml.beside(__file__, "endless"))
 def test_a_template_that_would_run_for_ever_or_grow_ends(text: str, shared: Evaluator) -> None:
     with pytest.raises(OverLimit) as refused:
         values(text, on=shared)

@@ -7,6 +7,7 @@ A container that runs one command of ROS 2, from a dict:
   run        the command, a list
   tmp        the volume for its /tmp, by default "tmp"
   mounts     further volume mounts, a list; optional
+  setup      scripts to source first, a list; by default .Values.workspaceSetup
 */ -}}
 {{- define "ros-service.container" -}}
 - name: {{ toJson .name }}
@@ -15,7 +16,7 @@ A container that runs one command of ROS 2, from a dict:
   {{- include "ros-service.start" . | nindent 2 }}
   env:
     {{- include "ros-service.env" .root | nindent 4 }}
-  {{- with include "ros-service.probes" .values.probes | trim }}{{ nindent 2 . }}{{ end }}
+  {{- with include "ros-service.probes" . | trim }}{{ nindent 2 . }}{{ end }}
   resources: {{ toJson .values.resources }}
   securityContext: {{ toJson .root.Values.securityContext }}
   volumeMounts: {{ prepend (.mounts | default list) (dict "name" (.tmp | default "tmp") "mountPath" "/tmp") | toJson }}
@@ -38,7 +39,7 @@ shell never interprets their characters. Without setup scripts, the image's own 
 command line.
 */ -}}
 {{- define "ros-service.start" -}}
-{{- with .root.Values.workspaceSetup -}}
+{{- with hasKey . "setup" | ternary .setup .root.Values.workspaceSetup -}}
 command: ["/bin/bash", "-c", "while [ \"$1\" != -- ]; do . \"$1\" || exit; shift; done; shift; exec \"$@\"", "start"]
 args: {{ concat . (list "--") $.run | toJson }}
 {{- else -}}
@@ -69,14 +70,15 @@ folder in the image. The values may set another HOME.
 {{- end -}}
 
 {{- /*
-A probe without a handler checks whether `ros2 launch` has a child process. It reads the parent
-processes from /proc and looks for one with `launch` but without `--` in its arguments: only the
-shell that sources the setup scripts has `--`. The check needs bash and grep, but no port and no ROS
+A probe without a handler checks whether `ros2 launch` (or `ros2 run`, if that is the command) has a
+child process. It reads the parent processes from /proc and looks for one with `launch` but without
+`--` in its arguments: only the shell that sources the setup scripts has `--`. The check needs bash and grep, but no port and no ROS
 discovery, which takes a second of processor time and fails on a busy network.
 */ -}}
 {{- define "ros-service.probes" -}}
 {{- $check := "grep -hs ^PPid: /proc/[0-9]*/status | { while read -r _ parent; do if grep -qszx launch /proc/$parent/cmdline; then grep -qszxe -- /proc/$parent/cmdline || exit 0; fi; done; exit 1; }" -}}
-{{- $probes := . -}}
+{{- if eq (index .run 1) "run" -}}{{- $check = replace "-qszx launch" "-qszx run" $check -}}{{- end -}}
+{{- $probes := .values.probes -}}
 {{- range $kind := list "startup" "readiness" "liveness" }}
 {{- $probe := get $probes $kind }}
 {{- if kindIs "map" $probe }}

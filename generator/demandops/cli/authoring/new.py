@@ -12,6 +12,7 @@ from typing import Any
 
 import click
 
+from demandops import __version__
 from demandops.base import addresses
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.naming import PATTERN_WORDS
@@ -139,11 +140,11 @@ def image(name: str, repository: str, state_repo: str, directory: Path, output: 
 # ---- ``new application`` ----
 #
 # The application's services form a chain: the first service reads the application's inputs, and
-# each further service reads the outputs of the service before it. One image contains the launch
-# files of all services.
+# each further service reads the outputs of the service before it. One image contains the nodes of
+# all services. What demands decide of a node is a ROS parameter, and changes while the node runs.
 
 _INPUT = re.compile(r"(?P<role>[^=]+)=(?P<type>.+)")
-_SHORT_TYPE = re.compile(r"(?P<package>\w+)/(?P<name>\w+)")
+_TYPE = re.compile(r"(?P<package>[A-Za-z]\w*)(/msg)?/(?P<name>[A-Za-z]\w*)", re.ASCII)
 _SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
 
 
@@ -151,7 +152,7 @@ _SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
 class _Service:
     name: str
     package: str
-    launch_file: str
+    executable: str
 
     @property
     def role(self) -> str:  # of its output, as the next service reads it
@@ -161,15 +162,16 @@ class _Service:
 def _input(text: str) -> tuple[str, str]:
     if not (match := _INPUT.fullmatch(text)):
         raise ValueError(f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image")
-    if short := _SHORT_TYPE.fullmatch(match["type"]):
-        full = f"{match['role']}={short['package']}/msg/{short['name']}"
-        raise ValueError(f"'{text}' has no message type of ROS 2; write {full}")
-    return match["role"], match["type"]
+    type = _TYPE.fullmatch(match["type"])
+    full = f"{type['package']}/msg/{type['name']}" if type else "package/msg/Name"
+    if match["type"] != full:
+        raise ValueError(f"'{text}' has no message type of ROS 2; write {match['role']}={full}")
+    return match["role"], full
 
 
 def _service(text: str) -> _Service:
     if not (match := _SERVICE.fullmatch(text)):
-        example = "detector=my_package/detector.launch.py"
+        example = "detector=my_package/detector"
         raise ValueError(f"'{text}' is not NAME=PACKAGE/FILE; write it like {example}")
     return _Service(match["name"], match["package"], match["file"])
 
@@ -188,7 +190,7 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object]]] = {
         _input,
     ),
     "--service": (
-        "Services, as name=package/file, such as detector=my_package/detector.launch.py; separate "
+        "Services, as name=package/file, such as detector=my_package/detector; separate "
         "several by spaces",
         _service,
     ),
@@ -238,8 +240,8 @@ def _asked(option: str) -> tuple[str, ...]:
     "services",
     multiple=True,
     metavar="NAME=PACKAGE/FILE",
-    help="A service and the launch file that it runs: detector=my_package/detector.launch.py. May "
-    "be repeated. Each further service reads the outputs of the service before it.",
+    help="A service and the executable or launch file of its node: detector=my_package/detector. "
+    "May be repeated. Each further service reads the outputs of the service before it.",
 )
 @click.option("--image", default="", metavar="IMAGE", help="The image, with a tag or digest.")
 @click.option(
@@ -261,9 +263,10 @@ def application(  # noqa: PLR0913 - as many as options
     directory: Path,
     output: str,
 ) -> None:
-    """Write a new application: definition, values, chart, registry, README and a demand.
+    """Write a new application: definition, values, chart, registry, README, a node and a demand.
 
-    On a terminal, the command asks for --input, --service and --image if they are missing.
+    Its nodes take new inputs, parameters and outputs while they run, as ROS parameters. On a
+    terminal, the command asks for --input, --service and --image if they are missing.
 
     \b
     Examples:
@@ -278,7 +281,7 @@ def application(  # noqa: PLR0913 - as many as options
     if not _APPLICATION_NAME.fullmatch(name):
         words = PATTERN_WORDS[_APPLICATION_NAME.pattern]
         raise InvalidInput.at("NAME", f"{quoted(name)} cannot be used here; write {words}")
-    if name in config.appdefs or name in config.charts or name in config.images:
+    if name in (*config.appdefs, *config.charts, *config.images, _SYNC):
         raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")
     given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
     missing = [option for option, values in given.items() if not values]
@@ -308,6 +311,11 @@ def application(  # noqa: PLR0913 - as many as options
     with busy("rendering an example of each application"):
         try_configuration(State(load({**existing, **files}), Ledger(), EVALUATE))
     then = [f"to check the files: demandops check {directory}"]
+    if (sync := f"registry/images/{_SYNC}.yaml") in files:
+        then.append(
+            f"{sync} names the image of DemandOps, which sets the nodes' parameters; build it as "
+            "docs/deployment.md says, or correct its name"
+        )
     if not is_allowed:
         domain = config.domain_of[node]
         then.append(
@@ -326,6 +334,7 @@ _APPLICATION_NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
 _RESULT = "result"
 _VERSION = "0.1.0"
 _LIBRARY_FOLDER = f"appdefs/charts/{charts.LIBRARY}"
+_SYNC = "demandops"  # the image with `demandops parameter-sync`
 
 
 def _application_files(
@@ -342,13 +351,22 @@ def _application_files(
     has_library = f"{_LIBRARY_FOLDER}/Chart.yaml" in config.files
     files, shared = ({}, config.files) if has_library else (library, library)
     version = re.search(r"(?m)^version: (\S+)$", shared[f"{_LIBRARY_FOLDER}/Chart.yaml"])
+    library_schema = json.loads(shared[f"{_LIBRARY_FOLDER}/values.schema.json"])
+    if "reconfigure" not in library_schema["definitions"][charts.EXPORT]["properties"]:
+        raise StateRepoError(
+            f"{_LIBRARY_FOLDER} is of an earlier version, which cannot change the parameters of a "
+            f"running node; copy {data_folder('appdefs') / 'charts' / charts.LIBRARY} over it, and "
+            "give the charts that use it new versions (nothing was changed)"
+        )
     given = {
         "NAME": name,
         "DESCRIPTION": description,
         "PACKAGE": services[0].package,
-        "FILE": services[0].launch_file,
+        "FILE": services[0].executable,
+        "ROLE": services[0].role,
         "REPOSITORY": image.repository,
         "RESULT": _RESULT,
+        "SYNC": _SYNC,
         "VERSION": _VERSION,
         "LIBRARY": charts.LIBRARY,
         "LIBRARY_FOLDER": _LIBRARY_FOLDER,
@@ -361,6 +379,7 @@ def _application_files(
     taken |= {service.prefix for own in config.services.values() for service in own.values()}
     taken |= {definition.prefix for definition in config.definitions.values()}
     inputs = {role: role for role in types}  # the origin of each input of the next service
+    types_of = {**types}  # its message type
     definitions: dict[str, Any] = {}
     for service in services:
         letters = re.sub("[^a-z0-9]", "", service.name)[:8]
@@ -371,21 +390,33 @@ def _application_files(
             "prefix": prefix,
             "inputs": inputs,
             "outputs": {_RESULT: f"/{{instance}}_{service.role}"},
+            "live": ["parameters"],
             "chart": name,
-            "images": [name],
+            "images": [name, _SYNC],
             "values": f"values/{service.name}.yaml.j2",
         }
         given["SERVICES"] += (
-            f"| `{service.name}` | `ros2 launch {service.package} {service.launch_file}` "
+            f"| `{service.name}` | `{service.executable}` of the ROS package `{service.package}` "
             f"| {', '.join(f'`{origin}`' for origin in inputs.values())} |\n"
         )
-        topics = (f'    {role}_topics: {{{{ topics.{role} | join(",") }}}}\n' for role in inputs)
-        own = {"SERVICE": service.name, "PACKAGE": service.package, "FILE": service.launch_file}
-        own["TOPICS"] = "".join(topics)
-        files[f"{root}/values/{service.name}.yaml.j2"] = _filled(
-            texts["values.yaml.j2"], given | own
-        )
+        modules = {role: type.replace("/", ".") for role, type in types_of.items()}
+        packages = sorted({"rclpy", *(module.rpartition(".")[0] for module in modules.values())})
+        own = {
+            "SERVICE": service.name,
+            "PACKAGE": service.package,
+            "FILE": service.executable,
+            "ROLE": service.role,
+            "TOPICS": "".join(f"    {role}_topics: {{{{ topics.{role} }}}}\n" for role in inputs),
+            "IMPORTS": "\n".join(f"import {package}" for package in packages),
+            "INPUTS": "\n".join(f'    "{role}_topics": {modules[role]},' for role in inputs),
+        }
+        for path, template in (
+            (f"values/{service.name}.yaml.j2", "values.yaml.j2"),
+            (f"nodes/{service.name}.py", "example-node"),
+        ):
+            files[f"{root}/{path}"] = _filled(texts[template], given | own)
         inputs = {service.role: f"{service.name}.{_RESULT}"}
+        types_of = {service.role: next(iter(types.values()))}  # the example passes these on
     fields = {
         "name": name,
         "description": description,
@@ -408,18 +439,23 @@ def _application_files(
         files[path] = _filled(texts[template], given)
     schema = charts.composed(
         f"Values of the chart {name}",
-        {"launch": json.loads(texts["launch.schema.json"])},
+        {"node": json.loads(texts["node.schema.json"])},
         files[f"{chart}/values.yaml"],
-        json.loads(shared[f"{_LIBRARY_FOLDER}/values.schema.json"]),
+        library_schema,
         shared[f"{_LIBRARY_FOLDER}/values.yaml"],
     )
     files[f"{chart}/values.schema.json"] = json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
-    for kind, content in (
-        ("charts", {"folder": chart, "version": _VERSION}),
-        ("images", image.model_dump(exclude_none=True)),
-    ):
-        path = f"registry/{kind}/{name}.yaml"
-        files[path] = document(path, kind, kind.title(), {kind: {name: content}})
+    registered = [
+        ("charts", name, {"folder": chart, "version": _VERSION}),
+        ("images", name, image.model_dump(exclude_none=True)),
+    ]
+    if _SYNC not in config.images:
+        # every application has this image; theirs is likely to be beside that of this one
+        beside = "/".join([*image.repository.split("/")[:-1], _SYNC])
+        registered.append(("images", _SYNC, {"repository": beside, "tag": __version__}))
+    for kind, entry, content in registered:
+        path = f"registry/{kind}/{entry}.yaml"
+        files[path] = document(path, kind, kind.title(), {kind: {entry: content}})
     return files
 
 

@@ -121,5 +121,21 @@ def text(name: str) -> str:
     model, file = SCHEMAS[name]
     generated: dict[str, Any] = model.model_json_schema(by_alias=True)
     describe(generated, model.__name__)
+    if model in (NodesFile, BrokersFile):
+        generated = _with_placeholders(generated)
     dialect = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": file}
     return json.dumps({**dialect, **generated, "title": file}, indent=2, ensure_ascii=False) + "\n"
+
+
+def _with_placeholders(part: Any) -> Any:  # noqa: ANN401 - any part of a schema
+    """Allow a text with a placeholder where an entry whose id is a pattern may have one."""
+    if isinstance(part, list):
+        return [_with_placeholders(each) for each in part]
+    if not isinstance(part, dict):
+        return part
+    if part.get("type") in ("integer", "number") or isinstance(part.get("pattern"), str):
+        told = {key: part[key] for key in ("title", "description", "examples") if key in part}
+        value = {key: part[key] for key in part if key not in told}
+        text = {"type": "string", "pattern": r"\{[A-Za-z_][A-Za-z0-9_]*\}"}
+        return told | {"anyOf": [value, text]}
+    return {key: _with_placeholders(value) for key, value in part.items()}

@@ -37,6 +37,7 @@ from demandops.cli.target import (
     signing_option,
 )
 from demandops.decide.decision import Decision, decide
+from demandops.decide.state import effects_of
 from demandops.model.config.base_model import duration_text
 from demandops.model.demand.goals import form_faults, is_demand_goal
 from demandops.repo import reader
@@ -88,7 +89,7 @@ class Document:
     "ends once they are proposed, and the next generator that starts on this machine for this "
     "state repo continues with them.",
 )
-@click.option("--action", metavar="NAME", help="Over ROS: the name of the node's action Demand.")
+@click.option("--action", metavar="NAME", help="Over ROS: the name of the node's action.")
 @click.option(
     "--timeout",
     type=click.FloatRange(min=0, min_open=True),
@@ -117,7 +118,7 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     FILE contains documents of the kind Demand (docs/demand.md), or goals of the action
     DeploymentRequest as YAML, as for `ros2 action send_goal`. Write - for standard input. With a
     state repo at hand, the command books directly in it; otherwise, and with --via ros, it sends
-    the documents of the kind Demand over ROS 2 to a running node. If it cannot parse one of the
+    the goals over ROS 2 to a running node. If it cannot parse one of the
     documents, it takes none. Otherwise it takes the documents in order, also if one is refused.
 
     \b
@@ -190,10 +191,11 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
 def _send(
     documents: list[Document], hold: bool, action: str | None, timeout: float | None, output: str
 ) -> list[Json]:
-    for document in documents:
-        if not is_demand_goal(document.goal):
-            message = "is not Demand; book a DeploymentRequest with --via git, without a node"
-            raise InvalidInput([fault("kind", message).within(document.file)])
+    kinds = {is_demand_goal(document.goal) for document in documents}
+    if hold and False in kinds:
+        raise click.UsageError("--hold is for documents of the kind Demand")
+    if action and len(kinds) > 1:
+        raise click.UsageError("--action names one action; send the goals of the other apart")
     # only here, because booking works without ROS
     from demandops.cli.main import imported  # noqa: PLC0415
 
@@ -234,6 +236,7 @@ def _row(index: int, request_id: str, outcome: str, **more: Any) -> Json:  # noq
         "warnings": [],
         "not_held": [],
         "placed": [],
+        "effects": [],
     } | more
 
 
@@ -305,7 +308,7 @@ def _book(
         elif not isinstance(result, Receipt):
             rows.append(_row(index, document.request_id, "proposed", proposal=result))
         else:
-            names = ("commit", "warnings", "not_held", "placed")
+            names = ("commit", "warnings", "not_held", "placed", "effects")
             more = {name: getattr(result, name) for name in names}
             rows.append(_row(index, result.request_id, result.outcome, **more))
     done.extend(
@@ -370,6 +373,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
             "warnings": decision.warnings,
             "not_held": decision.changes.not_held,
             "placed": decision.placed,
+            "effects": (*effects_of(decision.releases),),
             "releases": [asdict(release) for release in decision.releases],
             "files": sorted(decision.files),
         }
@@ -405,8 +409,8 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
             if proposal := row.get("proposal"):
                 told = f"awaiting approval {proposal['branch']} {proposal['link']}".rstrip()
             out.print(f"{title} {told}", soft_wrap=True)
-        for choice in row["placed"]:
-            out.print(f"  {choice}", soft_wrap=True)
+        for told in (*row["placed"], *(() if dry_run else row["effects"])):
+            out.print(f"  {told}", soft_wrap=True)
         warnings = [*row["warnings"]]
         lease = document.goal.get("lease") if isinstance(document.goal, dict) else None
         if isinstance(lease, int) and not isinstance(lease, bool):

@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -82,9 +82,17 @@ class Options:
     dry_run: bool = False
     propose: bool = False
 
-    def require_reason(self) -> None:
-        if not self.reason:
+    def with_reason(self) -> Options:
+        reason = self.reason
+        if not reason and sys.stdin.isatty() and not self.yes:
+            reason = _in_one_line(click.prompt("Why", err=True))
+        if not reason:
             raise click.UsageError("give the reason: -m TEXT")
+        return replace(self, reason=reason)
+
+
+def _in_one_line(text: str) -> str:
+    return " ".join(text.split())
 
 
 def changing(
@@ -102,7 +110,7 @@ def changing(
                 "-m",
                 "--reason",
                 metavar="TEXT",
-                callback=lambda ctx, param, text: " ".join((text or "").split()),
+                callback=lambda ctx, param, text: _in_one_line(text or ""),
                 help="Why; the commit message says it, and the file of an override.",
             ),
             *more,
@@ -390,16 +398,17 @@ def approve(name: str, commit: str, options: Options) -> None:
 def reject(name: str, commit: str, options: Options) -> None:
     """Reject a proposal: delete its branch, and record who and why.
 
-    The requester gets the reason; the generator aborts the goal with `turned-down`. If the branch
-    has changed since the command read it, the command changes nothing.
+    The requester gets the reason, which must be given; the generator aborts the goal with
+    `turned-down`. If the branch has changed since the command read it, the command changes nothing.
 
     \b
     Examples:
       demandops reject visit -m "The road is closed"
-      demandops reject demand/visit-3f2a9c1b04de --yes
+      demandops reject demand/visit-3f2a9c1b04de -m "Out of hours" --yes
     """
     with writable(options) as repo:
         proposal = _proposal(repo, name, commit, options.output)
+        options = options.with_reason()
         confirm("Reject it?", options.yes or bool(commit))
         summary = f"Reject {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
         person = warned_if_unnamed(repo.operator())

@@ -202,7 +202,7 @@ def entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
     *("join", "shutdown", "put", "release", "renew", "expire", "wait", "decommission", "drain"),
-    *("follow", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
+    *("follow", "discover", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
 )
 
 _TRAILERS = {
@@ -284,7 +284,10 @@ def log(
     """
     with reader.opened(state_repo) as repo:
         for side in filter(None, (commit_range or "").split("..")):
-            resolved(repo, side)
+            try:
+                resolved(repo, side)
+            except BeforeTheFirst as error:
+                errors.print(str(error))
         release, path = given.pop("release"), None
         if release is not None:
             tip = repo.commit((commit_range or "").rpartition("..")[2])
@@ -338,11 +341,11 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
     ]
     if (node := given["node"]) is not None:
         # no commit needs to have changed a node that the inventory has
-        nodes = {*repo.snapshot().state.config.nodes}
-        if node not in nodes and not any(
+        config = repo.snapshot().state.config
+        if not config.has_node(node) and not any(
             repo.changes_node(entry.commit, node) for entry in repo.log()
         ):
-            message = f"there is no node {quoted(node)}{suggestion(node, nodes)}"
+            message = f"there is no node {quoted(node)}{suggestion(node, config.nodes)}"
             faults.append(fault("--node", message))
     if faults:
         raise InvalidInput(faults)

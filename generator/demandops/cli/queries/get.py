@@ -180,9 +180,9 @@ def get(
         rows = rows_of(source, kind)
         if asked["gone"]:
             rows, end = past_rows(source, kind)
-        _refuse_unknown(listed, rows, source, names, wanted)
+        _refuse_unknown(listed, rows, source, names, wanted, gone=asked["gone"])
         rows = choose(rows)
-        _print_list(listed, source, rows, output, watch)
+        _print_list(listed, source, rows, output, watch, gone=asked["gone"])
         if end:
             errors.print(f"searched back to commit {end[:10]}; --at {end[:10]} goes on from there")
         while watch:
@@ -243,6 +243,8 @@ def _refuse_unknown(
     source: Source,
     names: tuple[str, ...],
     wanted: Sequence[tuple[str, str, str]],
+    *,
+    gone: bool,
 ) -> None:
     # what matches nothing is probably misspelled
     # a filter may match no item if it names something that exists, such as a node without demands
@@ -258,25 +260,39 @@ def _refuse_unknown(
     if wanted and not rows:  # then what some kind of thing has is no mistake
         labels = {label for name in KINDS for row in rows_of(source, name) for label in row.labels}
         labels |= {column.key.removesuffix("s") for column in kind.columns} | {*FILTERS, kind.word}
-    asked = [(name, "", {row.item["name"] for row in rows}) for name in names]
+    asked = [(name, kind.word, "", {row.item["name"] for row in rows}) for name in names]
     for label, pattern, option in wanted:
         if label not in labels:
             raise click.UsageError(
-                f"{option}: {kind.name} have no {label}; they have {', '.join(sorted(labels))}"
+                f"{option}: {kind.name}{' that are gone' if gone else ''} have no {label}; they "
+                f"have {', '.join(sorted(labels))}"
             )
         listed = (text for row in rows for text in row.labels.get(label, ()))
         if rows or label in existing:
-            asked.append((pattern, option, {*existing.get(label, ()), *listed}))
-    faults = [
-        fault(option, f"nothing is called {quoted(pattern)}{suggestion(pattern, candidates)}")
-        for pattern, option, candidates in asked
-        if not any(matches(name.casefold(), (pattern.casefold(),)) for name in candidates)
-    ]
+            asked.append((pattern, label, option, {*existing.get(label, ()), *listed}))
+
+    def is_in(names: Iterable[str], pattern: str) -> bool:
+        return any(matches(name.casefold(), (pattern.casefold(),)) for name in names)
+
+    faults = []
+    for pattern, label, option, candidates in asked:
+        if is_in(candidates, pattern) or (label == "node" and config.has_node(pattern)):
+            continue
+        of = KINDS.get(f"{label}s")
+        past = past_rows(source, of.name)[0] if of and of.has_past else []
+        if not is_in([row.item["name"] for row in past], pattern):
+            hint = suggestion(pattern, candidates)
+            faults.append(fault(option, f"nothing is called {quoted(pattern)}{hint}"))
+        elif of and not gone:
+            way = "add --gone" if kind.has_past else f"demandops get {of.name} --gone"
+            faults.append(fault(option, f"{quoted(pattern)} is gone; to see it: {way}"))
     if faults:
         raise InvalidInput(faults)
 
 
-def _print_list(kind: Kind, source: Source, rows: list[Row], output: str, watch: bool) -> None:
+def _print_list(
+    kind: Kind, source: Source, rows: list[Row], output: str, watch: bool, *, gone: bool = False
+) -> None:
     items = [row.item for row in rows]
     plain = json.loads(json.dumps({"kind": kind.name, "commit": source.commit, "items": items}))
     if output == "json" and watch:
@@ -286,6 +302,8 @@ def _print_list(kind: Kind, source: Source, rows: list[Row], output: str, watch:
     else:
         shown: list[str | Table] = [item["name"] for item in items]
         if output != "name":
-            shown = [list_table(kind, rows, source.now, wide=output == "wide")]
+            table = list_table(kind, rows, source.now, wide=output == "wide")
+            more = "; --gone lists what was" if kind.has_past and not gone else ""
+            shown = [replace(table, empty=table.empty + more)]
             shown += [f"{source.now:%H:%M:%S} UTC, at {source.commit[:10]}"] if watch else []
         formats.show(output, plain, shown)

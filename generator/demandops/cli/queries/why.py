@@ -256,9 +256,11 @@ def may(
         lines += [f"  {reason} requires the approval" for reason in answer.approval]
     else:
         lines = [f"yes: {what}"]
-        lines += [f"  {rule} allows it" for rule in answer.rules]
+        for rule in answer.rules:
+            alone = "; without it, a person would have to approve"
+            lines.append(f"  {rule} allows it{alone if rule in answer.approved_by else ''}")
     known = {*state.config.nodes, *state.ledger.indexed_names("requester")}
-    if requester not in known:
+    if requester not in known and not state.config.has_node(requester):
         unknown = f"no node is called '{requester}', and nobody of this name demands anything now"
         errors.print(f"note: {unknown}{suggestion(requester, known)}")
     data = {"requester": requester, "application": application, "allowed": not answer.faults}

@@ -132,7 +132,7 @@ def _delivery_faults(where: str, delivery: Delivery, services: Services) -> Iter
         yield fault(f"{where}.topic", problem)
 
 
-def _definition_faults(
+def _definition_faults(  # noqa: PLR0912 - a branch for each fault
     app: Application, appdef: ApplicationDefinition, config: Config
 ) -> Iterator[Fault]:
     unknown = [role for role, topics in app.inputs.items() if topics and role not in appdef.inputs]
@@ -140,12 +140,16 @@ def _definition_faults(
         message = f"{appdef.name} has no such input" + suggestion(role, appdef.inputs)
         yield fault(f"inputs.{role}", message)
     services = config.services[appdef.name]
-    parameters = {*appdef.parameters} if app.parameters else set()
-    parameters = parameters.union(*(service.parameters for service in services.values()))
-    for name in app.parameters:
-        if name not in parameters:
-            close = suggestion(name, parameters)
+    defined = {f"appdefs/{appdef.name}/appdef.yaml": appdef.parameters}
+    defined |= {service.file: service.parameters for service in services.values()}
+    for name, value in app.parameters.items():
+        known = {file: own[name] for file, own in defined.items() if name in own}
+        if not known:
+            close = suggestion(name, {*chain(*defined.values())})
             yield fault(f"parameters.{name}", f"{appdef.name} has no such parameter{close}")
+        for file, parameter in known.items():
+            if problem := parameter.problem(value):
+                yield fault(f"parameters.{name}", f"{problem} (in {file})")
     for service in services.values():
         if service.nodes and app.node in config.nodes and app.node not in service.runs_at:
             cluster = config.nodes[app.node].cluster

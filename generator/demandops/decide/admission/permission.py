@@ -205,13 +205,13 @@ def approval(
                     for rule in domain.rules
                     if matches(requester, rule.requesters) and first_uncovered(rule, access) is None
                 ]
+                free = [rule.name for rule in granting if not domain.asks(rule)]
+                requiring = [rule.name for rule in granting if rule.approval == "required"]
                 # one rule that grants the access without approval is enough
-                if any((rule.approval or domain.approval) == "none" for rule in granting):
-                    free = [rule.name for rule in granting if rule.approval == "none"]
-                    for name in free if domain.approval == "required" else ():
+                if free:
+                    for name in free if requiring or domain.approval == "required" else ():
                         exempting[f"rule '{name}' of access domain '{domain.name}'"] = None
                     continue
-                requiring = [rule.name for rule in granting if rule.approval == "required"]
                 for name in requiring:
                     reasons[f"rule '{name}' of access domain '{domain.name}'"] = None
                 if not requiring and domain.approval == "required":

@@ -192,6 +192,34 @@ class Parameter(CamelModel):
     description: Text = ""
     default: Any = None
     merge: Literal["union", "max", "min", "latest"] | None = None
+    minimum: int | float | None = None
+    maximum: int | float | None = None
+    one_of: Annotated[Items[Any], Field(min_length=1)] | None = None
+
+    def problem(self, value: object) -> str:
+        """Return why demands may not give this value, or one of its items; else nothing."""
+        if isinstance(value, list) and self.merge == "union":
+            return next(filter(None, map(self.problem, value)), "")
+        shown, is_bool = strict_yaml.short_repr(value), isinstance(value, bool)
+        if self.one_of and (is_bool, value) not in [(type(v) is bool, v) for v in self.one_of]:
+            return f"{shown} is not one of {', '.join(map(strict_yaml.short_repr, self.one_of))}"
+        for word, limit in (("minimum", self.minimum), ("maximum", self.maximum)):
+            if limit is None:
+                continue
+            if is_bool or not isinstance(value, int | float):
+                return f"{shown} is not a number, which the {word} {limit} needs"
+            if value != limit and (value < limit) is (word == "minimum"):
+                return f"{shown} is {'less' if value < limit else 'more'} than the {word} {limit}"
+        return ""
+
+    @model_validator(mode="after")
+    def _default_within(self) -> Parameter:
+        limits = [limit for limit in (self.minimum, self.maximum) if limit is not None]
+        if limits != sorted(limits):
+            raise ValueError(f"minimum {limits[0]} is above maximum {limits[1]}; swap them")
+        if self.default is not None and (problem := self.problem(self.default)):
+            raise ValueError(f"the default {problem}; change one of them")
+        return self
 
 
 class Deployed(CamelModel):

@@ -21,9 +21,12 @@ from demandops.model.config.appdef import (
 )
 from demandops.model.config.base_model import DnsLabel, faults_of, parse, parse_file
 from demandops.model.config.entry_patterns import (
+    NO_BROKER_PATTERNS,
     NOTHING_UNLISTED,
     EntryPattern,
+    EntryPatterns,
     UnlistedNodes,
+    may_match,
 )
 from demandops.model.config.inventory import Broker, Cluster, Kind, Node, id_in_domain, kind_of
 from demandops.model.config.override import OVERRIDES_ROOT, Override
@@ -63,7 +66,7 @@ def collection_of(path: str) -> str | None:
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
     # for example `inventory/nodes.yaml or inventory/nodes/`
-    used = {*files} or {collection}
+    used = {file for file in {*files} if collection_of(file) == collection} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
     return " or ".join([collection] * (collection in used) + folder)
 
@@ -92,8 +95,11 @@ class Config:
     overrides: Mapping[str, Override] = field(default_factory=dict)
     # The nodes and brokers whose id is a pattern
     node_patterns: Mapping[str, EntryPattern[Node]] = field(default_factory=dict)
-    broker_patterns: tuple[EntryPattern[Broker], ...] = ()
+    broker_patterns: Mapping[str, EntryPattern[Broker]] = field(default_factory=dict)
     unlisted: UnlistedNodes = field(default=NOTHING_UNLISTED, compare=False, repr=False)
+    unlisted_brokers: EntryPatterns[Broker] = field(
+        default=NO_BROKER_PATTERNS, compare=False, repr=False
+    )
     clients: ClientsFile = registry.DEFAULT_SETTINGS
     versions: Mapping[str, registry.VersionList] = field(default_factory=dict)
     # For each collection, a map from each entry to the file that has the entry
@@ -171,6 +177,12 @@ class Config:
         """Yield each listed node, and for each pattern one that stands for all its nodes."""
         yield from self.nodes.values()
         yield from (pattern.example for pattern in self.node_patterns.values())
+
+    def has_node(self, pattern: str) -> bool:
+        """Return whether a node has this name, or may match this pattern with ``*`` and ``?``."""
+        if "*" in pattern or "?" in pattern:
+            return may_match(pattern, (*self.nodes, *self.node_patterns))
+        return pattern in self.nodes or pattern in self.node_patterns
 
     def example_nodes(self) -> Iterator[str]:
         """Yield for each pattern an id of a node in an access domain, as far as it is found."""

@@ -54,7 +54,7 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
             if roles and role not in roles:
                 message = f"'{role}' is not an input of any application{suggestion(role, roles)}"
                 reader.add_fault(file, f"{place}.topics.{role}", message)
-    examples = (pattern.example for pattern in config.broker_patterns)
+    examples = (pattern.example for pattern in config.broker_patterns.values())
     for broker in (*config.brokers.values(), *examples):
         file, place = reader.places[configs.BROKERS_FILE][broker.node]
         reader.check_reference(file, f"{place}.node", broker.node, configs.NODES_FILE)

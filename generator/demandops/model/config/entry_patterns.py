@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -95,6 +96,13 @@ def _overlap(one: str, other: str) -> bool:
 # ---- an entry whose id is a pattern ----
 
 
+def may_match(pattern: str, ids: Iterable[str]) -> bool:
+    """Return whether a pattern with ``*`` and ``?`` may match one of the ids, or of their nodes."""
+    return any(
+        _overlap(pattern, glob_of(id)) if is_pattern(id) else matches(id, (pattern,)) for id in ids
+    )
+
+
 @dataclass(frozen=True)
 class EntryPattern(Generic[Entry]):
     """``data`` is the entry as it is written in ``file`` at ``place``; ``key`` names its id."""
@@ -121,9 +129,13 @@ class EntryPattern(Generic[Entry]):
         values = values_in(self.id, id)
         return values and {**values, "id": id}
 
-    def entry(self, id: str) -> Entry:
-        """Return the entry of an id that matches; raise ``InvalidInput`` with its faults."""
+    def entry(self, id: str, own: Mapping[str, Any] = MappingProxyType({})) -> Entry:
+        """Return the entry of an id that matches; raise ``InvalidInput`` with its faults.
+
+        The fields ``own`` are those of this id alone.
+        """
         data: Any = filled(self.data, self.values(id) or {})
+        data |= own
         try:
             try:
                 return self.model.model_validate(data)
@@ -141,9 +153,12 @@ class EntryPattern(Generic[Entry]):
     def example(self) -> Entry:
         """The entry of an id that matches, but with the pattern as its id; may be invalid."""
         in_id, where = names(self.id), field_path(self.place)
-        if len(in_id) > _MOST_PLACEHOLDERS:
-            message = f"{quoted(self.id)} has {len(in_id)} placeholders; write at most three"
-            raise InvalidInput([fault(where, message).within(self.file)])
+        if len(in_id) > _MOST_PLACEHOLDERS or "id" in in_id:
+            message = f"has {len(in_id)} placeholders; write at most three"
+            if "id" in in_id:
+                meant = quoted(self.id.replace("{id}", "{n}"))
+                message = f"{{id}} stands for the whole id; write another name, such as {meant}"
+            raise InvalidInput.at(f"{where}.{self.key}", message, file=self.file)
         known = {"id": None, **dict.fromkeys(in_id)}
         listed = ", ".join(f"{{{name}}}" for name in known)
         faults = [
@@ -160,7 +175,7 @@ class EntryPattern(Generic[Entry]):
                 return self.entry(id).model_copy(update={self.key: self.id})
             except InvalidInput as error:
                 errors.append(error)
-        raise errors[0]
+        raise min(errors, key=lambda error: len(error.faults))  # some only concern a digit
 
 
 def _read_number(
@@ -174,18 +189,35 @@ def _read_number(
             data[last] = float(data[last]) if "." in data[last] else int(data[last])
 
 
-def only_entry(patterns: Iterable[EntryPattern[Entry]]) -> Callable[[str], Entry | None]:
-    """Return a function that gives the valid entry of the only pattern that matches an id."""
-    globs = Globs((pattern.glob, pattern) for pattern in patterns)
+class EntryPatterns(Generic[Entry]):
+    """The patterns of one kind of entry; ``find`` gives an id's entry, or why it has none."""
 
-    @lru_cache(maxsize=65_536)
-    def entry(id: str) -> Entry | None:
-        matching = [pattern for _, pattern in globs.matching(id) if pattern.values(id)]
-        with suppress(InvalidInput):
-            return matching[0].entry(id) if len(matching) == 1 else None
-        return None
+    def __init__(self, word: str, patterns: Iterable[EntryPattern[Entry]] = ()) -> None:
+        self._word, self._patterns = word, tuple(patterns)
+        self._globs = Globs((pattern.glob, pattern) for pattern in self._patterns)
+        self.find = lru_cache(maxsize=65_536)(self._find)
 
-    return entry
+    def __iter__(self) -> Iterator[EntryPattern[Entry]]:
+        return iter(self._patterns)
+
+    def __len__(self) -> int:
+        return len(self._patterns)
+
+    def candidates(self, id: str) -> Iterator[EntryPattern[Entry]]:
+        return (pattern for _, pattern in self._globs.matching(id))
+
+    def _find(self, id: str) -> tuple[Entry | None, str]:
+        patterns = [pattern for pattern in self.candidates(id) if pattern.values(id)]
+        if len(patterns) > 1:
+            named = " and ".join(f"{quoted(each.id)} in {each.where}" for each in patterns[:2])
+            return None, f"matches {named}; narrow one of these patterns"
+        if not patterns:
+            return None, ""
+        try:
+            return patterns[0].entry(id), ""
+        except InvalidInput as error:
+            pattern = quoted(patterns[0].id)
+            return None, f"is no {self._word} of the pattern {pattern}: {error.faults[0]}"
 
 
 # ---- what the patterns of an inventory give for an id that nobody listed ----
@@ -226,12 +258,11 @@ class UnlistedNodes:
 
     def __init__(
         self,
-        patterns: Iterable[EntryPattern[Node]],
+        patterns: EntryPatterns[Node],
         domains: Mapping[str, AccessDomain],
         complete: Callable[[Node, AccessDomain | None], Node],
     ) -> None:
-        self._patterns = Globs((pattern.glob, pattern) for pattern in patterns)
-        self._domains, self._complete = domains, complete
+        self.patterns, self._domains, self._complete = patterns, domains, complete
         self._globs = Globs((glob, name) for name, d in domains.items() for glob in d.nodes)
         self.find = lru_cache(maxsize=65_536)(self._find)
 
@@ -260,21 +291,10 @@ class UnlistedNodes:
         names = {name for _, name in self._globs.overlapping(glob_of(pattern))}
         return [self._domains[name] for name in sorted(names)]
 
-    def candidates(self, id: str) -> Iterator[tuple[str, EntryPattern[Node]]]:
-        return self._patterns.matching(id)
-
     def _made(self, id: str) -> tuple[Node | None, AccessDomain | None, str]:
-        patterns = [pattern for _, pattern in self._patterns.matching(id) if pattern.values(id)]
-        if len(patterns) > 1:
-            named = " and ".join(f"{quoted(each.id)} in {each.where}" for each in patterns[:2])
-            return None, None, f"matches {named}; narrow one of these patterns"
-        if not patterns:
-            return None, None, ""
-        (pattern,) = patterns
-        try:
-            node = pattern.entry(id)
-        except InvalidInput as error:
-            return None, None, f"is no node of the pattern {quoted(pattern.id)}: {error.faults[0]}"
+        node, problem = self.patterns.find(id)
+        if node is None:
+            return None, None, problem
         by_name = {name: glob for glob, name in self._globs.matching(id)}
         if len(by_name) > 1:
             named = " and ".join(f"'{name}' by {quoted(by_name[name])}" for name in sorted(by_name))
@@ -282,4 +302,5 @@ class UnlistedNodes:
         return node, self._domains[min(by_name)] if by_name else None, ""
 
 
-NOTHING_UNLISTED = UnlistedNodes((), {}, lambda node, _: node)
+NO_BROKER_PATTERNS = EntryPatterns[Any]("broker")
+NOTHING_UNLISTED = UnlistedNodes(EntryPatterns("node"), {}, lambda node, _: node)

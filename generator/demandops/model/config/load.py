@@ -16,7 +16,7 @@ from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION, RENDER_VERSION
 from demandops.model.config import config as configs
-from demandops.model.config import inventory, registry
+from demandops.model.config import discovered, inventory, registry
 from demandops.model.config.appdef import (
     ApplicationDefinition,
     ServiceDefinition,
@@ -26,7 +26,7 @@ from demandops.model.config.appdef import (
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config, ConfigReader
 from demandops.model.config.cross_check import cross_check
-from demandops.model.config.entry_patterns import Globs, OnDemand, UnlistedNodes, only_entry
+from demandops.model.config.entry_patterns import EntryPatterns, Globs, OnDemand, UnlistedNodes
 from demandops.model.config.inventory import Node, id_in_domain
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.model.config.policy import AccessDomain, AccessDomainsFile
@@ -62,7 +62,11 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         )
         reader.add_fault(ROOT_FILE, repository.gitops, message)
     _refuse_unread(reader)
+    clusters = reader.read_items(
+        configs.CLUSTERS_FILE, inventory.ClustersFile, "clusters", inventory.Cluster, "name"
+    )
     nodes = reader.read_items(configs.NODES_FILE, inventory.NodesFile, "nodes", Node, "id")
+    nodes |= discovered.read_nodes(reader, clusters, nodes)
     domains = reader.read_items(
         configs.DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name"
     )
@@ -78,7 +82,8 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         capacity = settings.with_short_names(node.capacity) if node.capacity else node.capacity
         return node.model_copy(update={"capacity": capacity})
 
-    unlisted = UnlistedNodes(reader.patterns[configs.NODES_FILE], domains, completed)
+    node_patterns = EntryPatterns("node", reader.patterns[configs.NODES_FILE])
+    unlisted = UnlistedNodes(node_patterns, domains, completed)
     appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
     clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
@@ -92,12 +97,12 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
             clients = clients.model_copy(update={word: getattr(part, word)})
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
-    for pattern in reader.patterns[configs.NODES_FILE]:
+    for pattern in node_patterns:
         node = pattern.example
         for domain in unlisted.possible_domains(pattern.id):
             _in_further_domains(reader, {node.id: node}, domains, {node.id: domain})
     all_nodes = {id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()}
-    if reader.patterns[configs.NODES_FILE]:
+    if node_patterns:
         all_nodes = OnDemand(all_nodes, lambda id: (made := unlisted.find(id)) and made.node)
         domain_of = OnDemand(domain_of, lambda id: (made := unlisted.find(id)) and made.domain)
         hosts = OnDemand(hosts, unlisted.other_host)
@@ -105,14 +110,12 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         name: _services_of(appdef, definitions, all_nodes, settings, reader)
         for name, appdef in appdefs.items()
     }
-    clusters = reader.read_items(
-        configs.CLUSTERS_FILE, inventory.ClustersFile, "clusters", inventory.Cluster, "name"
-    )
     brokers = reader.read_items(
         configs.BROKERS_FILE, inventory.BrokersFile, "brokers", inventory.Broker, "node"
     )
-    if reader.patterns[configs.BROKERS_FILE]:
-        brokers = OnDemand(brokers, only_entry(reader.patterns[configs.BROKERS_FILE]))
+    broker_patterns = EntryPatterns("broker", reader.patterns[configs.BROKERS_FILE])
+    if broker_patterns:
+        brokers = OnDemand(brokers, lambda node: broker_patterns.find(node)[0])
     charts = reader.read_items(configs.CHARTS_FILE, registry.ChartsFile, "charts", registry.Chart)
     images = reader.read_items(configs.IMAGES_FILE, registry.ImagesFile, "images", registry.Image)
     for name, image in images.items():
@@ -146,9 +149,10 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         repo_settings=settings,
         clusters=clusters,
         nodes=all_nodes,
-        node_patterns={each.id: each for each in reader.patterns[configs.NODES_FILE]},
-        broker_patterns=tuple(reader.patterns[configs.BROKERS_FILE]),
+        node_patterns={each.id: each for each in node_patterns},
+        broker_patterns={each.id: each for each in broker_patterns},
         unlisted=unlisted,
+        unlisted_brokers=broker_patterns,
         brokers=brokers,
         domains=domains,
         charts=charts,
@@ -166,7 +170,8 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     )
     cross_check(config, reader)
     if reader.faults:
-        raise InvalidInput(dict.fromkeys(reader.faults))
+        faults = (discovered.in_entry(each, reader, clusters) for each in reader.faults)
+        raise InvalidInput(dict.fromkeys(faults))
     return config
 
 
@@ -176,6 +181,8 @@ def _refuse_unread(reader: ConfigReader) -> None:
     for path in sorted(reader.files):
         folder, *names = path.split("/")
         if folder not in folders or not path.endswith((".yaml", ".yml")):
+            continue
+        if discovered.is_discovered(path):  # people see with `check` that they may not edit it
             continue
         if configs.collection_of(path) is None and not any(name.startswith(".") for name in names):
             stems = [
@@ -323,12 +330,14 @@ def _domains_of_nodes(
             matching.setdefault(name, pattern)
             if len(matching) > _MOST_DOMAINS:
                 break
+        file, place = reader.places[configs.NODES_FILE][node]
+        if len(matching) > 1 and discovered.is_discovered(file):
+            continue  # a label in a cluster must not make people's files invalid
         if len(matching) > 1:  # an overlap by accident must not move the node
             by = " and ".join(
                 f"'{name}' by {quoted(pattern)} in {reader.places[configs.DOMAINS_FILE][name][0]}"
                 for name, pattern in sorted(matching.items())[:_MOST_DOMAINS]
             )
-            file, place = reader.places[configs.NODES_FILE][node]
             message = (
                 f"'{node}' is in the access domains {by}; narrow these patterns so that only one "
                 "domain matches the node, and list the other domains under 'accessDomains' of the "

@@ -174,6 +174,10 @@ class AccessDomain(CamelModel):
         without = {*NOT_BY_DEFAULT, *([_NETWORK_POLICY] if self.network == "namespace" else [])}
         return tuple(kind for name, kind in KINDS.items() if name not in without)
 
+    def asks(self, rule: Rule) -> bool:
+        """Return whether a person must approve what the rule grants."""
+        return (rule.approval or self.approval) == "required"
+
     def how_to_allow(self, kind: str, file: str) -> str:
         if kind == _NETWORK_POLICY and self.network == "namespace":
             return f"remove 'network: namespace' of the domain in {file}"

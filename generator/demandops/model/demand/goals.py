@@ -313,7 +313,7 @@ def form_faults(goal: object) -> Sequence[Fault]:
     return ()
 
 
-def is_demand_goal(goal: dict[str, Any]) -> bool:
+def is_demand_goal(goal: Mapping[str, Any]) -> bool:
     # the reference's goals have neither of these fields
     return "kind" in goal or "apiVersion" in goal
 

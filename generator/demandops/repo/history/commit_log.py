@@ -47,6 +47,7 @@ from demandops.repo.history.commit_message import (
 _LAST_SECOND = 253402300799
 _GITHUB = ("GitHub", "noreply@github.com")
 _NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
+RELEASE_FILES = f"{CLUSTERS_ROOT}/*/*/*/*.yaml"
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,25 +310,26 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
         return None
     files = trees.blobs(commit_of(repo, tip).tree, (CLUSTERS_ROOT,))
     current = (path for path, _ in files if path.endswith(f"/{name}.yaml"))
-    return next(current, None) or next(iter(_removed(repo, tip, f"{name}.yaml", "-1")), None)
+    gone = _removed(repo, tip, RELEASE_FILES.replace("*.yaml", f"{name}.yaml"), "-1")
+    return next(current, None) or next(iter(gone), None)
 
 
-def stopped_releases(repo: Repository, tip: str | Oid) -> dict[str, list[str]]:
-    """Return the names of the releases that each commit removed."""
-    removed, commit = dict[str, list[str]](), ""
-    for item in _removed(repo, tip, "*.yaml", form="%H"):
+def removed_files(repo: Repository, tip: str | Oid, glob: str) -> dict[str, dict[str, str]]:
+    """Return the files of releases or overrides that each commit removed: names with paths."""
+    removed, commit = dict[str, dict[str, str]](), ""
+    for item in _removed(repo, tip, glob, form="%H"):
         if "/" not in item:
             commit = item
             continue
         name = item.rsplit("/", 1)[-1].removesuffix(".yaml")
         if _NAME.fullmatch(name):  # a chart's file has a version
-            removed.setdefault(commit, []).append(name)
+            removed.setdefault(commit, {})[name] = item.lstrip("\n")  # git ends a commit's line
     return removed
 
 
-def _removed(repo: Repository, tip: str | Oid, file: str, *more: str, form: str = "") -> list[str]:
+def _removed(repo: Repository, tip: str | Oid, glob: str, *more: str, form: str = "") -> list[str]:
     options = ("--diff-filter=D", "--no-renames", *more, f"--format={form}", "--name-only")
-    return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
+    return _git_log(repo, tip, None, *options, f":(glob){glob}")
 
 
 # by git, because libgit2 has no walk that is limited to a path

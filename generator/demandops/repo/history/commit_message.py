@@ -10,14 +10,15 @@ from datetime import datetime, timezone
 
 import pygit2
 
-from demandops.base.naming import SubjectKind
+from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import escaped, harmless, is_visible, one_line
 from demandops.base.settings import RENDER_VERSION
 from demandops.decide.booking import Drain, Restoration
 from demandops.decide.decision import Decision
+from demandops.decide.discovery import Discovered
 from demandops.decide.state import ReleaseChange
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
-from demandops.model.demand.demand import Decommission
+from demandops.model.demand.demand import Application, Decommission, Held
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import OVERRIDE_PREFIX, ClaimKey
 from demandops.model.ledger.records import Wait
@@ -109,6 +110,7 @@ _MAX_AUTHOR = 200
 _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
 _MOST_PROBLEMS = 20
+_MOST_NODES = 50
 _UNCHANGED = "Desired state: unchanged."
 _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 _CRUD = " .,:;\"'\\"  # Git removes these at both ends of a name, and refuses an empty name
@@ -210,16 +212,35 @@ def _requesters(decision: Decision) -> tuple[str, ...]:
     return tuple(sorted({who for claim in claims if claim for who in claim.requesters}))
 
 
+def _given_up_in_part(decision: Decision) -> dict[Subject, str]:
+    # of claims that stay, because a shutdown lists only some of their topics
+    def topics(held: Held) -> set[str]:
+        if isinstance(held, Application):
+            return {topic.topic for _, topic in held.all_inputs()}
+        return {route.source for route in held.topics}
+
+    parts = dict[Subject, str]()
+    for change in decision.changes.claims if decision.request.operation == "shutdown" else ():
+        if not (change.before and change.after):
+            continue
+        if lost := sorted(topics(change.before.held) - topics(change.after.held)):
+            some = f"topic{'s' if len(lost) > 1 else ''} {', '.join(lost)}"
+            parts[change.key.subject] = f"{some} of {change.key.subject.id}"
+    return parts
+
+
 def _told(
     decision: Decision, requesters: tuple[str, ...], received: datetime
 ) -> tuple[str, str, list[tuple[str, str]]]:
     # the title, the reason, and the trailers of this operation
     request, changes = decision.request, decision.changes.claims
-    kinds = Counter(subject.kind for subject in decision.changes.subjects())
+    parts = _given_up_in_part(decision)
+    kinds = Counter(each.kind for each in decision.changes.subjects() if each not in parts)
     counts = [(kinds[kind], kind.value[:-1]) for kind in SubjectKind if kinds[kind]]
-    what = " and ".join(f"{count} {kind}{'s' if count > 1 else ''}" for count, kind in counts)
+    counted = (f"{count} {kind}{'s' if count > 1 else ''}" for count, kind in counts)
+    what = " and ".join((*counted, *parts.values()))
     what_of_whom = f"{what} in the name of {', '.join(requesters)}"
-    subjects = ", ".join(subject.id for subject in decision.changes.subjects())
+    subjects = ", ".join(parts.get(each, each.id) for each in decision.changes.subjects())
     time = time_text(received)
     if isinstance(request, Restoration):
         to = request.to[:12]
@@ -344,6 +365,32 @@ def of_override_end(
         *override_trailers([override.path], keys),
         *demand_trailers(keys),
         *more,
+        ("Render-Version", str(RENDER_VERSION)),
+    ]
+    return compose(paragraphs, trailers)
+
+
+def of_discovery(found: Sequence[Discovered], releases: tuple[ReleaseChange, ...]) -> str:
+    names = [each.path.rpartition("/")[2].removesuffix(".yaml") for each in found]
+    counts = [
+        (sum(len(getattr(each, field)) for each in found), word)
+        for field, word in (("came", "came"), ("left", "left"), ("changed", "changed"))
+    ]
+    told = ", ".join(f"{count} {word}" for count, word in counts if count) or "as they are"
+    paragraphs = [
+        [one_line(f"Nodes of {', '.join(names)}: {told}", _MAX_SUBJECT)],
+        [f"Why: {', '.join(names)} said so."],
+    ]
+    for name, each in zip(names, found, strict=True):
+        signed = [("+", each.came), ("-", each.left), ("~", each.changed)]
+        lines = [f"  {sign} {line}" for sign, lines in signed for line in lines]
+        more = len(lines) - _MOST_NODES
+        paragraphs.append([f"{name}:", *lines[:_MOST_NODES]])
+        paragraphs[-1] += [f"  and {more} more"] if more > 0 else []
+    paragraphs.append(_desired_state(releases) if releases else [_UNCHANGED])
+    trailers = [
+        ("Operation", "discover"),
+        *(("Cluster", name) for name in names),
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return compose(paragraphs, trailers)

@@ -194,11 +194,11 @@ class PendingProposal:
     def require(self, commit: str) -> None:
         # whoever may push to the branch finds another commit with the same 10 digits in minutes
         if commit != self.commit:
-            raise InvalidInput.at(
-                "",
-                f"{self.branch} is at commit {self.commit}, not at {quoted(commit)}; if it has "
-                "changed since, look at it again",
-            )
+            remedy = "if it has changed since, look at it again"
+            if commit and self.commit.startswith(commit):
+                remedy = "give the whole id, because another commit may begin with these digits"
+            message = f"{self.branch} is at commit {self.commit}, not at {quoted(commit)}; {remedy}"
+            raise InvalidInput.at("", message)
 
 
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
