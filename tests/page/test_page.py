@@ -72,7 +72,12 @@ BUILD = Path(__file__).parents[2] / "build" / "page"
 VIEWS = [
     *("", "map", "map?q=vehicle00", "demands", "services", "connections", "leases", "timeline"),
     *("timeline?at=HEAD~2", f"release?name={FAILING}", "demand?id=vehicle01-to-cloud"),
-    *("overrides", "thing?kind=node&name=edge", "thing?kind=requester&name=vehicle00"),
+    *(
+        "overrides",
+        "demands?gone=1",
+        "thing?kind=node&name=edge",
+        "thing?kind=requester&name=vehicle00",
+    ),
 ]
 SERIOUS = ("serious", "critical")
 
