@@ -160,7 +160,7 @@ def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, 
         for tick in range(ROS_SECONDS * HZ):
             for number, name in enumerate(names):
                 message.header.frame_id = name
-                message.pose.position.x, message.pose.position.y = number * 7.0, tick * 1.4
+                message.pose.position.x, message.pose.position.y = number * 50.0, tick * 1.4
                 publishers[number % len(publishers)].publish(message)
                 sent += 1
             rclpy.spin_once(node, timeout_sec=0)
