@@ -11,6 +11,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import lru_cache
 from typing import Literal
 
 from pydantic import Field
@@ -70,6 +71,7 @@ def path_of(cluster: str) -> str:
     return f"{DISCOVERED_ROOT}/{cluster}.yaml"
 
 
+@lru_cache(maxsize=1024)  # each look at a cluster's nodes reads the file that was loaded
 def read(text: str | None, path: str) -> tuple[DiscoveredNode, ...]:
     return parse_file(DiscoveredNodesFile, text, path).nodes if text is not None else ()
 
