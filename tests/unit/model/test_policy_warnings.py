@@ -45,31 +45,7 @@ def test_requests_that_no_node_or_pod_has_are_told(name: str) -> None:
         assert words in one
 
 
-_VALUES = "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"
-_CHART = "appdefs/object-detection-fusion/charts/object-fusion/values.yaml"
-
-
-@pytest.mark.parametrize(
-    ("live", "changes", "words"),
-    [
-        ("inputs", {}, []),
-        ("serviceAccount", {}, []),  # of the chart
-        ("parameters", {}, []),  # of its library
-        ("input", {}, ["'input' is no value that", "did you mean 'inputs'?"]),
-        ("seldom", {}, ["'seldom' is no value that appdefs/", "correct it, or remove it"]),
-        (
-            "seldom",
-            {_VALUES: {"inputs:": "…\n{% if false %}\nseldom: 1\n{% endif %}\ninputs:"}},
-            [],
-        ),
-        (
-            "parameters",
-            {_VALUES: {"inputs:": "reconfigure: restart\n…"}},
-            ["write `reconfigure: live`"],
-        ),
-        ("parameters", {_CHART: {"inputs:": "reconfigure: restart\n…"}}, ["restarts the pods, as"]),
-    ],
-)
+@pytest.mark.parametrize(("live", "changes", "words"), plain_yaml.beside(__file__, "live-warnings"))
 def test_a_live_value_that_does_not_exist_is_told(
     live: str, changes: dict[str, Any], words: list[str]
 ) -> None:
