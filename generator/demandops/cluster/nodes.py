@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
+from http import HTTPStatus
 from typing import Any
 
 from demandops.base.quoting import one_line
@@ -147,6 +148,8 @@ class _NodeWatch:
 
     def _tell(self, error: Exception) -> None:
         self._version, self._api = "", None  # the kubeconfig may have a new token
+        if getattr(error, "status", None) == HTTPStatus.GONE:  # nothing changed for long: list anew
+            return
         if (reason := one_line(reason_of(error))) != self._told:
             self._told = reason
             message = "the nodes of cluster '%s' cannot be read (%s) and stay as they are; retrying"
