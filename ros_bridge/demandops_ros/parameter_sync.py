@@ -99,7 +99,7 @@ class ParameterSetter:
         )
         self._target = str(node.resolve_service_name(target))
         self._on_answer = on_answer
-        self.problem = f"{self._target} has not been asked yet"
+        self.problem = f"{self._target} has not answered yet"
         self._lock = REAL.lock()
         self._wanted: Mapping[str, Any] = {}
         self._version = 0
