@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from http import HTTPStatus
 from typing import Any
 
 from demandops.base.quoting import one_line
@@ -20,6 +19,8 @@ log = logging.getLogger("demandops")
 
 # How many nodes one answer has; each lists its images, so that all together may be large
 _PAGE = 500
+# The status of a watch from a version that the API server no longer has
+_GONE = 410
 
 
 class ClusterNodes:
@@ -148,7 +149,7 @@ class _NodeWatch:
 
     def _tell(self, error: Exception) -> None:
         self._version, self._api = "", None  # the kubeconfig may have a new token
-        if getattr(error, "status", None) == HTTPStatus.GONE:  # nothing changed for long: list anew
+        if getattr(error, "status", None) == _GONE:  # nothing changed for long: list anew
             return
         if (reason := one_line(reason_of(error))) != self._told:
             self._told = reason
