@@ -16,7 +16,6 @@ import yaml
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, StateRepoError
 from demandops.base.settings import GENERATED_ROOTS
 from demandops.model.ledger import claim
-from demandops.repo import reader
 from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot as snapshots
 from demandops.serve.generator import Generator
@@ -264,38 +263,6 @@ def test_no_file_that_a_person_writes_stops_the_demands(
     assert [one for one in outcomes if one in ("join", "shutdown")] == [
         *("join", "join", "shutdown", "join")
     ]
-
-
-@pytest.mark.parametrize("configuration", ["1" * 40, "abc", "HEAD", "main", "side"])
-def test_a_forged_record_of_the_configuration_in_effect_stops_no_start(
-    bare: Path, person: Person, configuration: str
-) -> None:
-    """Not even one of a commit that never was main, which nobody has approved."""
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-    if configuration == "side":
-        configuration = rig.git(bare, "commit-tree", "main^{tree}", "-p", "main", "-m", "x")
-    message = f"x\n\nWhy: x\n\nConfiguration: {configuration}\nRender-Version: 3\n"
-    person.change({}, message, FORGER)
-    with reader.opened(str(bare)) as repo:
-        (verdict,) = repo.verify([rig.tip(bare)])
-    assert verdict.fault
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(2))
-
-
-def test_a_submodule_in_place_of_a_claim_releases_nothing(generator: Generator, bare: Path) -> None:
-    rig.book(generator, goal(1), goal(2))
-    (path,) = rig.claims(bare, "fusion-1")
-    whole, index = text(bare, path), {"GIT_INDEX_FILE": str(bare / "index")}
-    rig.git(bare, "read-tree", "main", **index)
-    rig.git(bare, "update-index", "--cacheinfo", f"160000,{'1' * 40},{path}", **index)
-    tree = rig.git(bare, "write-tree", **index)
-    made = rig.git(bare, "commit-tree", tree, "-p", "main", "-m", "By hand")
-    rig.git(bare, "update-ref", "refs/heads/main", made)
-    rig.book(generator, goal(3))
-    assert text(bare, path) == whole
-    rig.assert_sound(bare)
 
 
 @pytest.mark.parametrize("message", ["By hand", "x\n\nWhy: x\n\nRender-Version: 3"])
