@@ -38,8 +38,9 @@ help:  ## List the targets
 $(SYSTEM): system-%:
 	@PYTHON='$(PYTHON)' setup/system $*
 
-setup: system-demo $(STAMP)  ## Make .venv with everything in it, the ROS 2 interfaces included
-	@$(PY) ros_bridge/interfaces/build.py
+# MESSAGES are folders of packages whose messages the event detector reads (docs/detector.md).
+setup: system-demo $(STAMP)  ## Make .venv with everything in it, the ROS 2 interfaces included, and MESSAGES=folders
+	@$(PY) ros_bridge/interfaces/build.py $(MESSAGES)
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "setup: installing Python packages into $(VENV), about a minute"

@@ -25,7 +25,8 @@ from demandops.cluster.health import Target as ReleaseTarget
 from demandops.decide.state import try_configuration
 from demandops.detect import rule_file
 from demandops.detect.detector import Detector, Want
-from demandops.detect.event_engine import MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Observation
+from demandops.detect.message_reader import MessageReader, Unreadable
 from demandops.model.config import base_model, override
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.load import load
@@ -47,7 +48,7 @@ from tests.kit.config import state_of
 from tests.kit.goals import EXPERIMENT
 from tests.kit.memory import NOW
 from tests.unit.cluster.cases import Letters
-from tests.unit.demand.test_fuzz import ANYTHING, KEY, TEXT, assert_told, outcome
+from tests.unit.demand.test_refused import ANYTHING, KEY, TEXT, assert_told, outcome
 
 _SEEDS = plain_yaml.beside(__file__, "seeds")
 _BOOKED = sorted(golden.GOLDEN.rglob("expected/*/ledger/**/*.yaml"))

@@ -14,6 +14,24 @@ OPTIONS = "--input camera=a/msg/B --image r/i:1 --service detector=p/d --service
 APPLICATION = f"new application tracking {OPTIONS}".split()
 
 
+def test_an_earlier_library_stays_for_the_charts_that_use_it(
+    checkout: Path, demandops: Run
+) -> None:
+    library = checkout / "appdefs" / "charts" / "ros-service"
+    schema = library / "values.schema.json"
+    schema.write_text(schema.read_text().replace('"reconfigure"', '"former"'))
+    before = {path: path.read_text() for path in library.rglob("*") if path.is_file()}
+    assert demandops(*APPLICATION, "-C", checkout).code == 0
+    assert before == {path: path.read_text() for path in library.rglob("*") if path.is_file()}
+    chart = (checkout / "appdefs/tracking/charts/tracking/Chart.yaml").read_text()
+    (used,) = yaml.safe_load(chart)["dependencies"]
+    now = checkout / "appdefs" / "charts" / f"ros-service-{used['version']}"
+    assert used["repository"] == f"file://../../../charts/{now.name}"
+    assert f"\nversion: {used['version']}\n" in (now / "Chart.yaml").read_text()
+    again = [word.replace("tracking", "tracing") for word in APPLICATION]
+    assert demandops(*again, "-C", checkout).code == 0
+
+
 def test_every_file_that_people_write_names_its_schema(demandops: Run, tmp_path: Path) -> None:
     repo = tmp_path / "fleet"
     assert demandops("init", repo).code == 0

@@ -13,7 +13,7 @@ from demandops.base.errors import InvalidInput
 from demandops.base.quantities import amount_of, amount_text
 from demandops.model.config.appdef import ignored_fields, without_ignored_fields
 from demandops.model.config.inventory import Zenoh
-from demandops.model.config.registry import Image
+from demandops.model.config.registry import Image, precedence
 from demandops.model.config.repo_settings import ArgoCd, Proposals
 from pydantic import ValidationError
 
@@ -68,7 +68,16 @@ def test_an_address_may_be_of_ipv6_but_hold_no_secret(name: str) -> None:
             model(url=url)
 
 
-# ---- quantities ----
+# ---- versions and quantities ----
+
+
+def test_the_order_of_versions_is_that_of_semantic_versioning() -> None:
+    before = "1.0.0-1 1.0.0-2 1.0.0-10 1.0.0-a 1.0.0-a.1 1.0.0-a.b 1.0.0-b"
+    listed = f"{before} 1.0.0 1.0.2 1.0.10 1.2.0 2.0.0".split()
+    shuffled = sorted(listed)
+    assert shuffled != listed
+    assert sorted(shuffled, key=precedence) == listed
+
 
 QUANTITIES = plain_yaml.beside(__file__, "quantities")
 

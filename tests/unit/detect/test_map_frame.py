@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 from demandops.detect import rule_file
-from demandops.detect.event_engine import MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Observation
+from demandops.detect.message_reader import MessageReader, Unreadable
 from hypothesis import given
 from hypothesis import strategies as st
 

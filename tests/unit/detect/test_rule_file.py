@@ -13,7 +13,7 @@ from demandops.base.errors import Fault, InvalidInput
 from demandops.cli.authoring import schema
 from demandops.detect import rule_file
 from demandops.detect.condition import entity_in
-from demandops.detect.event_engine import MessageReader, Unreadable
+from demandops.detect.message_reader import MessageReader, Unreadable
 from demandops.detect.rule_file import POSITIONS
 
 from tests.kit import plain_yaml

@@ -37,6 +37,8 @@ from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.ledger.claim import LEDGER_ROOT
+from demandops.repo import reader
+from demandops.repo.reader import Reader
 from demandops.views.vocabulary import Json, override_data
 
 # ---- what the commands share: their options and selection ----
@@ -56,6 +58,12 @@ selecting = target.name_options(
 
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
     return {name: list(values) for name, values in given.items() if values}
+
+
+def _options_for(repo: Reader, name: str) -> str:
+    # what a name means that was given without an option
+    kinds = [kind for kind in _SELECTED if name in all_names(repo, f"{kind}s")]
+    return " or ".join(f"--{kind} {shlex.quote(name)}" for kind in kinds)
 
 
 def ends_at(text: str | None) -> str | None:
@@ -260,7 +268,11 @@ def _end(
             message = "is not valid, so nothing is overridden; correct or remove the file with git"
             raise InvalidInput.at("", message, file=_path_of(name))
         if override is None:
-            message = f"there is no override '{name}'{suggestion(name, overrides)}"
+            close = suggestion(name, overrides)
+            message = f"there is no override '{name}'; did you mean: {_options_for(repo, name)}"
+            message = (
+                message if _options_for(repo, name) else f"there is no override '{name}'{close}"
+            )
             raise InvalidInput.at("", message)
         # a person may have changed what the file selects since it was suspended
         selects = [select.model_dump(exclude_none=True).items() for select in override.select]
@@ -283,7 +295,7 @@ def name_of(selected: Mapping[str, tuple[str, ...]]) -> str:
     return "suspend-" + naming.slug_with_hash(words, repr(chosen), 6)
 
 
-@click.command()
+@click.command(context_settings={"allow_extra_args": True})
 @selecting
 @until_option
 @editing
@@ -300,6 +312,11 @@ def suspend(expires: str | None, options: Options, **selected: tuple[str, ...]) 
       demandops suspend --application 'edge/*' --until 2h -m "Service"
       demandops suspend --connection vehicle00/edge -m "Too much data" --propose
     """
+    if names := click.get_current_context().args:
+        with reader.opened(options.state_repo, only_read=True) as repo:
+            meant = _options_for(repo, names[0])
+        told = f"; did you mean: {meant}" if meant else ""
+        raise click.UsageError(f"say by an option what {quoted(names[0])} is{told}")
     effect = {"expires": expires, "deny": True}
     _create(name_of(selected), f"Suspend {described(selected)}", selected, effect, options)
 
@@ -393,16 +410,17 @@ _node = click.argument("node", metavar="NODE", shell_complete=names_of("nodes"))
 @_node
 @editing
 def drain(node: str, options: Options) -> None:
-    """Take a node out of use: nothing new is placed there.
+    """Take a node out of use: the generator places nothing there.
 
     The command sets `drained: true` in the inventory. The generator then moves away what it placed
-    on the node. What a demand itself put on the node stays; `demandops release` or `demandops
-    decommission` ends that.
+    on the node, and places nothing there. What a demand names the node for stays, and such demands
+    are still accepted; an override with `--on` moves it, and `demandops release` ends it.
 
     \b
     Examples:
       demandops drain edge --dry-run
       demandops drain edge -m "Maintenance"
+      demandops override create off-edge --node edge --on cloud -m "Maintenance"
     """
     _set_drained(node, True, options)
 
