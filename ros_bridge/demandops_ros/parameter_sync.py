@@ -120,7 +120,7 @@ class ParameterSetter:
                         f"number between {-_LARGEST - 1} and {_LARGEST}"
                     )
             try:
-                as_the_node_has_it(name, value, 0)
+                as_the_node_has_it(name, value, 0).to_parameter_msg()
             except (TypeError, ValueError) as error:
                 raise type(error)(f"parameter {name}: {error}") from None
         with self._lock:
