@@ -22,7 +22,7 @@ OPTIONS = (
 def scaffold(world: World) -> dict[str, str]:
     """Return the files of a new application, as a person gets them in a clone."""
     clone = world.folder / "author"
-    git(world.folder, "clone", "--quiet", world.push_url, str(clone))
+    git(world.folder, "clone", "--quiet", world.url, str(clone))
     demandops(world.folder, "new", "application", "listening", *OPTIONS, "-C", str(clone))
     new = git(clone, "ls-files", "--others").splitlines()
     files = {path: (clone / path).read_text() for path in new}
