@@ -121,3 +121,8 @@ def test_every_file_that_people_write_names_its_schema(demandops: Run, tmp_path:
         assert mark == "# yaml-language-server: ", path
         valid = jsonschema_rs.validator_for(json.loads((path.parent / place).read_text())).is_valid
         assert valid(read(path)) and not valid(read(path) | {"misspelt": 1}), path
+
+
+def test_outputs_are_named_in_the_definition(demandops: Run, tmp_path: Path) -> None:
+    ran = demandops(*APPLICATION, "-C", tmp_path, "--output", "spots=std_msgs/msg/Int32")
+    assert (ran.code, "list outputs of services in appdef.yaml" in ran.err) == (2, True)
