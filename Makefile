@@ -17,7 +17,7 @@ SIMULATION_TESTS := tests/simulation
 KILL_TESTS := tests/ros/test_crash.py
 # What takes long because it has remotes, crashes, ROS, brokers, servers or much work.
 PROCESS_TESTS := tests/ros tests/conformance tests/experiment tests/unit/decide/test_budget.py \
-  tests/unit/model/test_thousands_of_entries.py $(addprefix tests/integration/,repo mqtt web \
+  $(addprefix tests/integration/,repo mqtt web \
     test_command_line.py test_get.py test_hostile_checkouts.py test_inbound_webhook.py \
     test_person_commands.py test_proposals.py)
 # One worker more than cores, because one is busy with the tests of ROS, which mostly wait.
@@ -38,8 +38,9 @@ help:  ## List the targets
 $(SYSTEM): system-%:
 	@PYTHON='$(PYTHON)' setup/system $*
 
-setup: system-demo $(STAMP)  ## Make .venv with everything in it, the ROS 2 interfaces included
-	@$(PY) ros_bridge/interfaces/build.py
+# MESSAGES are folders of packages whose messages the event detector reads (docs/detector.md).
+setup: system-demo $(STAMP)  ## Make .venv with everything in it, the ROS 2 interfaces included, and MESSAGES=folders
+	@$(PY) ros_bridge/interfaces/build.py $(MESSAGES)
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "setup: installing Python packages into $(VENV), about a minute"
@@ -129,6 +130,7 @@ e2e-argocd: system-e2e-argocd setup go  ## Run the end-to-end tests with Argo CD
 # With FIGURES=1 the target also draws the plots of the docs: docs/figures
 experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
 experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (examples/experiment/full/README.md)
+	@$(if $(findstring unlisted,$(EXPERIMENT)),$(PY) ros_bridge/interfaces/build.py examples/experiment/unlisted/messages)
 	@$(PY) -m examples.experiment.full $(EXPERIMENT)
 
 check: system-test setup  ## Format, lint, types, imports, docs, test, test-processes and test-packages

@@ -13,6 +13,7 @@ from demandops.cli.output import errors, progress
 from demandops.cli.target import signing_option
 from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.leadership import Leadership
+from demandops.cluster.nodes import ClusterNodes
 from demandops.cluster.rollouts import RolloutWatcher
 from demandops.repo.reader import Reader
 from demandops.serve.agenda import DEFAULT_INTERVAL, parse_interval
@@ -166,6 +167,9 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
             )
             parts.callback(leadership.close)
             signals.wait(lambda: leadership.is_leader)
+        nodes = ClusterNodes(clusters, generator.nodes_changed)
+        parts.callback(nodes.close)
+        generator.take_over_nodes(nodes.of)  # here, because only the leader writes them
         if signals.stopping:  # a signal came before this process was the leader
             generator.close()
         else:

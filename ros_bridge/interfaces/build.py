@@ -1,15 +1,21 @@
-"""Build our ROS 2 interfaces into the virtual environment whose interpreter runs this script.
+"""Build ROS 2 interfaces into the virtual environment whose interpreter runs this script.
+
+    build.py [FOLDER ...]
+
+These are our own packages, and the messages of each package in a FOLDER, so that the event detector
+can read them: msg/*.msg, with or without the rest of a package. The environment keeps a copy of
+FOLDER's definitions, and later builds take that.
 
 The script needs only the standard library, and nothing imports it. The environment must have the
 ROS 2 wheels of PyPI; afterwards `import demandops_interfaces` works without any environment
 variable. In a ROS installation colcon builds the same packages, without this script.
 
-The environment has a record of what is installed. A build deletes the record before it changes the
-first installed file. It writes the new record as its last step. So an interrupted build never
-counts as finished.
+The environment has a record of what is installed. A build deletes a package's entry before it
+changes the first installed file, and writes the new entry as its last step. So an interrupted build
+never counts as finished.
 
-Exit codes: 0 installed or already up to date, 1 a requirement is missing (the message names it),
-3 a stage failed, 130 interrupted.
+Exit codes: 0 installed or already up to date, 1 a folder cannot be used or a requirement is missing
+(the message names it), 3 a stage failed, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -18,6 +24,7 @@ import fcntl
 import hashlib
 import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -25,15 +32,23 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 SOURCES = Path(__file__).resolve().parent
 PACKAGES = ("application_manager_interfaces", "demandops_interfaces")
 PREFIX = Path(sys.prefix)
 SITE = Path(sysconfig.get_path("purelib"))
 RECORD = PREFIX / "share" / "demandops" / "interfaces.json"
+# The definitions of the folders that were given to this build or an earlier one
+KEPT = PREFIX / "share" / "demandops" / "messages"
+# PyPI has no wheel of tf2_msgs. It is no package here, so that colcon takes that of the ROS
+# installation.
+MESSAGES = SOURCES / "tf2_msgs"
 
 # The wheels that the build needs, by the names of the folders that pip creates.
 WHEELS = (
@@ -54,12 +69,38 @@ BOOTSTRAPPED = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 TAIL_LINES = 40
 
 VERIFY = """
+import sys
+from importlib import import_module
 from rclpy.type_support import check_for_type_support
-from application_manager_interfaces.action import DeploymentRequest
-from demandops_interfaces.srv import GetBookkeeping
-check_for_type_support(DeploymentRequest)
-check_for_type_support(GetBookkeeping)
+for name in sys.argv[1:]:
+    module, _, interface = name.rpartition(".")
+    check_for_type_support(getattr(import_module(module), interface))
 """
+
+# For a package of which only the messages are built
+CMAKE = """
+cmake_minimum_required(VERSION 3.21)
+project({name})
+foreach(package ament_cmake rosidl_default_generators {needs})
+  find_package(${{package}} REQUIRED)
+endforeach()
+include("${{CMAKE_CURRENT_SOURCE_DIR}}/wheels.cmake")
+rosidl_generate_interfaces({name} {files} DEPENDENCIES {needs})
+ament_export_dependencies(rosidl_default_runtime {needs})
+ament_package()
+"""
+MANIFEST = """<package format="3">
+  <name>{name}</name><version>0.0.0</version><description>Messages</description>
+  <maintainer email="nobody@demandops.invalid">nobody</maintainer><license>unknown</license>
+  <buildtool_depend>ament_cmake</buildtool_depend>
+  <buildtool_depend>rosidl_default_generators</buildtool_depend>
+  <member_of_group>rosidl_interface_packages</member_of_group>
+</package>
+"""
+
+
+class Refused(Exception):
+    """Raised for a folder that cannot be built; the text names it and says what to do."""
 
 
 class StageFailed(Exception):
@@ -72,24 +113,25 @@ class StageFailed(Exception):
         super().__init__(f"{tail}\nfailed: {stage}\nthe full log: {kept}")
 
 
-def main() -> int:
+def main(*given: str) -> int:
     """Build if necessary, print what happened, and return the exit code."""
-    digest = fingerprint()
     try:
-        if not is_current(digest):
+        packages = find_packages(given)
+        if not all(is_current(package) for package in packages.values()):
             faults = missing(os.environ)
             if faults:
                 print("\n".join(faults), file=sys.stderr)
                 return 1
             RECORD.parent.mkdir(parents=True, exist_ok=True)
             with RECORD.with_suffix(".lock").open("w") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-                # Another build may have finished while this one waited.
-                if not is_current(digest):
-                    with tempfile.TemporaryDirectory(prefix="demandops-interfaces-") as folder:
-                        build(Path(folder), digest)
-                    return 0
+                fcntl.flock(lock, fcntl.LOCK_EX)  # another build may finish while this one waits
+                with tempfile.TemporaryDirectory(prefix="demandops-interfaces-") as folder:
+                    if build(Path(folder), packages):
+                        return 0
         print(f"interfaces: up to date in {PREFIX}")
+    except Refused as refusal:
+        print(refusal, file=sys.stderr)
+        return 1
     except StageFailed as failure:
         print(failure, file=sys.stderr)
         return 3
@@ -99,27 +141,124 @@ def main() -> int:
     return 0
 
 
-def fingerprint() -> str:
-    """Return a digest of everything the result depends on: sources, script, wheels, interpreter."""
-    digest = hashlib.sha256()
-    paths = [path for package in PACKAGES for path in (SOURCES / package).rglob("*")]
-    for path in sorted([*paths, SOURCES / "wheels.cmake", Path(__file__).resolve()]):
-        if path.is_file():
+@dataclass(frozen=True)
+class Package:
+    """A package to build: one of ours, or the messages in ``folder``, which need ``needs``."""
+
+    name: str
+    folder: Path
+    needs: tuple[str, ...] = ()
+    digest: str = ""
+
+    @property
+    def is_ours(self) -> bool:
+        return self.name in PACKAGES
+
+    @property
+    def files(self) -> list[Path]:
+        pattern = "**/*" if self.is_ours else "msg/**/*.msg"
+        return sorted(path for path in self.folder.glob(pattern) if path.is_file())
+
+    @property
+    def interfaces(self) -> list[str]:
+        kinds = (".msg", ".srv", ".action")
+        found = [path for path in self.files if path.suffix in kinds]
+        return [f"{self.name}.{path.suffix[1:]}.{path.stem}" for path in found]
+
+    def copy_to(self, folder: Path) -> None:
+        for path in self.files:
+            copy = folder / path.relative_to(self.folder)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, copy)
+
+
+def find_packages(given: Iterable[str]) -> dict[str, Package]:
+    """Return all packages to build, each after those that it needs."""
+    folders = {name: SOURCES / name for name in PACKAGES}
+    for path in (MESSAGES, *sorted(KEPT.glob("*"))):
+        if not any(SITE.glob(f"ros_{path.name}-*.dist-info")):
+            folders[path.name] = path
+    chosen: dict[str, Path] = {}
+    for text in given:
+        below = Path(text).resolve().rglob("msg")
+        inside = sorted(path.parent for path in below if any(path.glob("**/*.msg")))
+        if not inside:
+            raise Refused(f"{text}: has no file msg/*.msg; name the folder of an interface package")
+        for folder in inside:
+            name = _name_of(folder)
+            if chosen.setdefault(name, folder) != folder:
+                raise Refused(f"{folder}: is named {name}, like {chosen[name]}; give one of them")
+    folders |= chosen
+    found = {name: _read_package(name, folder, folders) for name, folder in folders.items()}
+    needs = {name: package.needs for name, package in found.items()}
+    try:
+        order = [name for name in TopologicalSorter(needs).static_order() if name in found]
+    except CycleError as error:
+        names = " and ".join(sorted({*error.args[1]}))
+        raise Refused(f"{names}: need each other's messages; put these into one package") from None
+    # all on which each result depends: sources, script, wheels, interpreter
+    wheels = sorted(path.name for path in SITE.glob("*.dist-info"))
+    relevant = [name for name in wheels if name.startswith(("ros_", "numpy-"))]
+    common = "\n".join([*relevant, str(PREFIX), sys.version]).encode()
+    common += b"".join(path.read_bytes() for path in (SOURCES / "wheels.cmake", Path(__file__)))
+    packages: dict[str, Package] = {}
+    for name in order:
+        digest = hashlib.sha256(common)
+        for need in needs[name]:
+            digest.update(packages[need].digest.encode() if need in packages else b"")
+        for path in found[name].files:
             content = path.read_bytes()
-            digest.update(f"{path.relative_to(SOURCES)} {len(content)}\n".encode() + content)
-    wheels = [path.name for path in SITE.glob("*.dist-info")]
-    relevant = sorted(name for name in wheels if name.startswith(("ros_", "numpy-")))
-    digest.update("\n".join([*relevant, str(PREFIX), sys.version]).encode())
-    return digest.hexdigest()
+            place = path.relative_to(found[name].folder)
+            digest.update(f"{place} {len(content)}\n".encode() + content)
+        packages[name] = replace(found[name], digest=digest.hexdigest())
+    return packages
 
 
-def is_current(digest: str) -> bool:
-    """Return whether the record has this digest, and whether all files in the record exist."""
+def _name_of(folder: Path) -> str:
+    manifest = folder / "package.xml"
+    text = manifest.read_text(encoding="utf-8", errors="replace") if manifest.is_file() else ""
+    named = re.search(r"<name>\s*(.*?)\s*</name>", text)
+    name = named[1] if named else folder.name
+    if not re.fullmatch("[a-z][a-z0-9_]*", name):
+        raise Refused(f"{folder}: {name!r} is no name of a package; rename the folder")
+    if name in PACKAGES or any(SITE.glob(f"ros_{name}-*.dist-info")):
+        raise Refused(f"{folder}: {name} is installed already; leave it out")
+    return name
+
+
+def _read_package(name: str, folder: Path, known: Mapping[str, Path]) -> Package:
+    package = Package(name, folder)
+    if package.is_ours:
+        return package
+    used = set[str]()
+    for path in package.files:
+        place = path.relative_to(folder)
+        if not re.fullmatch(r"msg(/[A-Za-z0-9_]+)*/[A-Z][A-Za-z0-9]*\.msg", str(place)):
+            raise Refused(f"{path}: is no name of a message; write it like msg/EgoData.msg")
+        text = path.read_text(encoding="utf-8", errors="replace")
+        used |= {*re.findall(r"^\s*([a-z][a-z0-9_]*)/", text, re.MULTILINE)}
+    for need in sorted(used - {name}):
+        if need not in known and not (PREFIX / "share" / need / "msg").is_dir():
+            raise Refused(f"{folder}: needs {need}, which is not installed; give its folder too")
+    return Package(name, folder, tuple(sorted(used - {name})))
+
+
+def read_record() -> dict[str, Any]:
     try:
         record = json.loads(RECORD.read_text(encoding="utf-8"))
+        return record if isinstance(record, dict) else {}
     except (OSError, ValueError):
-        return False
-    return record["digest"] == digest and all((PREFIX / file).exists() for file in record["files"])
+        return {}
+
+
+def is_current(package: Package) -> bool:
+    """Return whether the record has the package's digest, and all files that it names exist."""
+    entry = read_record().get(package.name)
+    return (
+        isinstance(entry, dict)
+        and entry["digest"] == package.digest
+        and all((PREFIX / file).exists() for file in entry["files"])
+    )
 
 
 def missing(environ: Mapping[str, str]) -> list[str]:
@@ -165,47 +304,66 @@ def _missing_tools(environ: Mapping[str, str]) -> dict[str, str]:
     return {tool: package for present, tool, package in checks if not present}
 
 
-def build(folder: Path, digest: str) -> None:
-    """Configure, compile and install every package, then write the record.
+def build(folder: Path, packages: Mapping[str, Package]) -> bool:
+    """Configure, compile and install what is not current; return whether anything was.
 
     Raises:
         StageFailed: if a command fails.
     """
+    stale = [package for package in packages.values() if not is_current(package)]
+    ours = [package for package in stale if package.is_ours]
     cores = len(os.sched_getaffinity(0))
-    # CMake configures on one core, so configure the packages in parallel; compilers use all cores.
+    # CMake configures on one core, so configure ours in parallel; compilers use all cores.
     with ThreadPoolExecutor(max_workers=min(cores, len(PACKAGES))) as pool:
-        list(pool.map(lambda package: _configure(folder, package), PACKAGES))
-    for package in PACKAGES:
-        command = ["cmake", "--build", str(folder / package), "--parallel", str(cores)]
-        _stage(f"build {package}", command, folder / f"{package}.log")
-    RECORD.unlink(missing_ok=True)
-    for package in PACKAGES:
-        _remove_installed(package)
-        command = ["cmake", "--install", str(folder / package)]
-        _stage(f"install {package}", command, folder / f"{package}.log")
-    _stage("verify", [sys.executable, "-c", VERIFY], folder / "verify.log")
-    manifests = [folder / package / "install_manifest.txt" for package in PACKAGES]
-    installed = [Path(line) for file in manifests for line in file.read_text().splitlines()]
-    files = sorted(str(path.relative_to(PREFIX)) for path in installed)
+        list(pool.map(lambda package: _configure(folder, package), ours))
+    for package in stale:
+        name, log = package.name, folder / f"{package.name}.log"
+        if package not in ours:
+            _configure(folder, package)
+        command = ["cmake", "--build", str(folder / name), "--parallel", str(cores)]
+        _stage(f"build {name}", command, log)
+        _write_record({key: entry for key, entry in read_record().items() if key != name})
+        _remove_installed(name)
+        _stage(f"install {name}", ["cmake", "--install", str(folder / name)], log)
+        _stage(f"verify {name}", [sys.executable, "-c", VERIFY, *package.interfaces], log)
+        if package.folder.parent not in (SOURCES, KEPT):
+            shutil.rmtree(KEPT / name, ignore_errors=True)
+            package.copy_to(KEPT / name)
+        manifest = (folder / name / "install_manifest.txt").read_text().splitlines()
+        files = sorted(str(Path(line).relative_to(PREFIX)) for line in manifest)
+        _write_record({**read_record(), name: {"digest": package.digest, "files": files}})
+    return bool(stale)
+
+
+def _write_record(record: Mapping[str, Any]) -> None:
     draft = RECORD.with_suffix(".new")
-    draft.write_text(json.dumps({"digest": digest, "files": files}, indent=1), encoding="utf-8")
+    draft.write_text(json.dumps(record, indent=1), encoding="utf-8")
     draft.replace(RECORD)
 
 
-def _configure(folder: Path, package: str) -> None:
+def _configure(folder: Path, package: Package) -> None:
+    source = package.folder
+    if not package.is_ours:
+        source = folder / f"{package.name}-source"
+        package.copy_to(source)
+        shutil.copy(SOURCES / "wheels.cmake", source)
+        files = " ".join(str(path.relative_to(package.folder)) for path in package.files)
+        text = CMAKE.format(name=package.name, needs=" ".join(package.needs), files=files)
+        (source / "CMakeLists.txt").write_text(text)
+        (source / "package.xml").write_text(MANIFEST.format(name=package.name))
     generator = ["-G", "Ninja"] if shutil.which("ninja") else []
     command = [
         "cmake",
         *generator,
-        *("-S", str(SOURCES / package)),
-        *("-B", str(folder / package)),
+        *("-S", str(source)),
+        *("-B", str(folder / package.name)),
         f"-DCMAKE_PREFIX_PATH={PREFIX}",
         f"-DCMAKE_INSTALL_PREFIX={PREFIX}",
         f"-DPython3_EXECUTABLE={sys.executable}",
         "-DBUILD_TESTING=OFF",
         "-DDEMANDOPS_WITHOUT_CPP=ON",
     ]
-    _stage(f"configure {package}", command, folder / f"{package}.log")
+    _stage(f"configure {package.name}", command, folder / f"{package.name}.log")
 
 
 def _stage(stage: str, command: list[str], log: Path) -> None:
@@ -251,4 +409,4 @@ def _remove_installed(package: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(*sys.argv[1:]))

@@ -7,13 +7,12 @@ The benchmark prints the seconds of each question.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from contextlib import closing
-from functools import partial
+from collections.abc import Iterator
+from contextlib import closing, redirect_stdout
+from io import StringIO
 from pathlib import Path
 
-from demandops.repo import reader
-from demandops.repo.history import commit_log
+from demandops.cli.main import run
 from demandops.serve.generator import Generator
 
 from tests.benchmarks import fleet
@@ -41,44 +40,24 @@ def lay_down(folder: Path) -> Path:
     return laid
 
 
-def timed(what: str, call: Callable[[], object]) -> None:
-    start = time.perf_counter()
-    found = call()
-    print(f"{what:<60} {time.perf_counter() - start:8.2f} s  {found}")
+def questions() -> Iterator[str]:
+    edge, newcomer = fleet.edge_id(0), fleet.spare_id(0)
+    yield "bookkeeping"
+    yield "why od-edge00001-v00001x0"  # it is as it was at first
+    yield f"why {edge}/fusion"  # it changed often
+    yield f"why od-{edge}-{newcomer}"  # it stopped
+    yield f"log --requester {newcomer}"
+    for whole in ("", " --whole"):
+        yield f"verify main~{VERIFIED}..main{whole}"
 
 
 def measure(repo: Path) -> None:
-    with reader.opened(str(repo)) as opened:
-        tip = opened.commit()
-        path_of = partial(commit_log.release_path, opened.objects, tip)
-        timed("loading the newest commit", lambda: len(opened.snapshot().state.ledger))
-        old = path_of("od-edge00001-v00001x0")
-        often = path_of(f"of-{fleet.edge_id(0)}-fusion") or _fusion(opened, tip)
-        timed("history of a file that is as it was at first", lambda: _told(opened, old, tip))
-        timed("history of a file that changed often", lambda: _told(opened, often, tip))
-        gone = f"od-{fleet.edge_id(0)}-{fleet.spare_id(0)}"
-        timed("history of a release that stopped", lambda: path_of(gone))
-        first = f"{[*opened.log()][-1].time:%Y-%m-%dT%H:%M:%S}"
-        timed("a time at the far end", lambda: opened.commit(first)[:10])
-        timed("log of one requester", lambda: sum(1 for e in opened.log() if gone in e.summary))
-        for whole in (False, True):
-            how = "whole" if whole else "by differences"
-            timed(f"verify {VERIFIED} commits {how}", partial(_verify, opened, whole=whole))
-
-
-def _fusion(opened: reader.Reader, tip: str) -> str:
-    files = opened.changed_files(opened.commit("main~2"), tip, ("clusters",))
-    return files[0] if files else "clusters"
-
-
-def _told(opened: reader.Reader, path: str | None, tip: str) -> str:
-    history = opened.history(path or "", tip, 10)
-    return f"{len(history.newest)} and {history.more} more"
-
-
-def _verify(opened: reader.Reader, *, whole: bool) -> int:
-    commits = opened.revisions(f"main~{VERIFIED}..main")
-    return sum(verdict.holds for verdict in opened.verify(commits, whole=whole))
+    for question in questions():
+        start = time.perf_counter()
+        with redirect_stdout(StringIO()) as told:
+            code = run([*question.split(), "--state-repo", str(repo)])
+        took, lines = time.perf_counter() - start, told.getvalue().count("\n")
+        print(f"{question:<50} {took:8.2f} s, {lines} lines, exit code {code}")
 
 
 def main() -> None:

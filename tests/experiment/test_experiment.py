@@ -15,7 +15,7 @@ from demandops.detect import rule_file
 from rosbags.rosbag2 import StoragePlugin
 
 from examples.experiment import paper
-from examples.experiment.full import fleet, large, report, routes
+from examples.experiment.full import fleet, large, report, routes, unlisted
 from examples.experiment.full.checks import checks
 from examples.experiment.full.outcome import Formed, Outcome, Settings, savings, steps
 from examples.experiment.full.participants import EGO_DATA
@@ -128,6 +128,17 @@ def test_each_check_fails_without_its_subject(name: str) -> None:
     assert any(check in found for found in faults(replace(run, **change(run))))
 
 
+def test_what_comes_back_must_come_while_a_vehicle_is_near_and_only_then() -> None:
+    run = good()
+    come = run.arrivals[EGO]
+    for found, holds in ((come, True), ([], False), ([*come, OVER - 1], False)):
+        *_, check = unlisted.checks(
+            replace(run, delivered={topic: {VEHICLE: found} for topic in unlisted.BACK})
+        )
+        assert check.holds is holds
+    assert unlisted.requesters({VEHICLE}).items() > paper.requesters({VEHICLE}).items()
+
+
 def test_the_times_of_events_what_is_saved_and_the_report() -> None:
     run = good()
     joins, leaves = (step.delays() for step in steps(run))
@@ -161,6 +172,16 @@ def test_each_seed_has_an_order_of_its_own_and_seed_0_the_paper_s() -> None:
     for seed in range(7):
         times = [event.at for event in events(seed)]
         assert min(later - at for at, later in itertools.pairwise(times)) > GAP_S / 4
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_few_of_many_vehicles_are_near_at_once_and_no_two_events_coincide(seed: int) -> None:
+    vehicles = [f"vehicle{number}" for number in range(20)]
+    near = Near.read(unlisted.FILES / "rules.yaml")
+    found = events_of(predicted(routes.crowd(seed, 6.0, vehicles), near, 400), near, 400)
+    assert sorted(event.vehicle for event in found) == sorted(vehicles * 2)
+    assert max(itertools.accumulate(1 if event.joins else -1 for event in found)) <= 4
+    assert min(later.at - event.at for event, later in itertools.pairwise(found)) > 2
 
 
 @pytest.mark.parametrize("vehicle", routes.VEHICLES)

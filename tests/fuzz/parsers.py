@@ -25,7 +25,8 @@ from demandops.cluster.health import Target as ReleaseTarget
 from demandops.decide.state import try_configuration
 from demandops.detect import rule_file
 from demandops.detect.detector import Detector, Want
-from demandops.detect.event_engine import MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Observation
+from demandops.detect.message_reader import MessageReader, Unreadable
 from demandops.model.config import base_model, override
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.load import load

@@ -100,29 +100,3 @@ def test_one_thing_has_the_documented_keys_in_every_command(on: On, played: GitR
     assert keys["changed release"] == [*changed["releases"][0]] == [*back["releases"][0]]
     assert keys["changed entry of the bookkeeping"] == [*changed["bookkeeping"][0]]
     assert keys["fault"] == [*failed.json()["faults"][0]]
-
-
-def test_a_rollback_gives_back_books_and_files(on: On, played: GitRepo) -> None:
-    git(played, "config", "user.name", "Ada <A>")
-    git(played, "config", "user.email", "ada@example.org")
-    wanted = git(played, "rev-parse", "main~2:ledger", "main~2:clusters")
-    before, back = played.tip, ("rollback", "main~2", "--yes")
-    dry = on(*back, "--output", "json", "--dry-run").json()
-    assert (played.tip, dry["commit"]) == (before, None)
-    found = on(*back, "--output", "json", "-m", "they left\nby mistake").json()
-    assert found == dry | {"commit": played.tip, "outcome": "restored"}
-    assert git(played, "rev-parse", "main:ledger", "main:clusters") == wanted
-    assert (found["dropped"], found["changed_back"]) == ([], [])
-    assert {*map(tuple, (one["requesters"] for one in found["restored"]))} == {
-        *(("station00", vehicle) for vehicle in ("vehicle00", "vehicle01"))
-    }
-    assert f"+ {DETECTION}" in git(played, "log", "-1", "--format=%b", "main")
-    trailers = "%(trailers:key=Operation,key=Restores,key=Reason,valueonly,separator=%x2C)"
-    said = git(played, "log", "-1", f"--format=%an|%ae|{trailers}", "main")
-    trailers = f"rollback,{found['to']},they left by mistake"
-    assert said == f"Ada (A)|ada@example.org|{trailers}"
-    assert [row["commit"] for row in on.json("log", "--operation", "rollback")] == [played.tip]
-    assert on("verify").code == 0
-    other = git(played, "commit-tree", "-m", "other", f"{played.tip}^{{tree}}")
-    ran = on("rollback", other, "-m", "x", "-y")
-    assert ran.code == 1 and f"commit {other} is not in the history" in ran.err

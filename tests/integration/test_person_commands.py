@@ -34,8 +34,6 @@ def test_who_is_unknown_to_git_is_told_how_to_change_that(
 
 
 class TestSuspend:
-    SUSPEND = ("suspend", "--requester", "vehicle00", "-m", "Sold", "-y")
-
     def test_a_resume_ends_no_suspension_of_another_selection_with_the_same_name(
         self, on: On, joined: GitRepo, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -50,17 +48,6 @@ class TestSuspend:
         assert on("resume", "--node", rival, "-y").code != 0
         assert joined.tip == before
         assert on("resume", "--node", "vehicle00", "-y").code == 0
-
-    def test_a_lock_that_a_killed_program_left_is_told_with_the_remedy(
-        self, on: On, joined: GitRepo
-    ) -> None:
-        lock = joined.path / "refs/heads/main.lock"
-        lock.write_text("")
-        told = on.refused(*self.SUSPEND).splitlines()[-1]
-        assert "another program locks main of" in told
-        assert told.endswith(" if no program writes there, remove refs/heads/main.lock in it")
-        lock.unlink()
-        assert on(*self.SUSPEND).code == 0
 
 
 def test_a_person_sees_the_consequence_and_is_asked(joined: GitRepo) -> None:

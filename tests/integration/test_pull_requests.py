@@ -6,7 +6,6 @@ More is in ``stories/check.yaml`` and ``stories/checkouts.yaml``.
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from pathlib import Path
 
@@ -111,30 +110,6 @@ def test_the_override_suggested_gives_the_file_that_was_edited_by_hand(
     on.book(perception(id="second"))
     written = on.state.files()[FUSION]
     assert [*yaml.safe_load_all(written)] == [*yaml.safe_load_all(edited)]
-
-
-def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, check: Run) -> None:
-    edit(branch / DETECTION, {"interval: 10m": "interval: 10m\n  suspend: true"})
-    ran = check()
-    assert (ran.out, ran.err.startswith(f"error: {DETECTION}: {LOST}, and change ")) == ("", True)
-    for path in (DETECTION, CLIENT):
-        (branch / path).unlink()
-    edit(branch / "bootstrap" / "c-its.yaml", {"prune: true": "prune: false"})
-    foreign = {
-        "bootstrap/extra.yaml": "is in a generated folder",
-        f"{EDGE}/extra.yaml": "is in a generated folder",
-        "ledger/notes.yaml": "is not the path of a claim",
-    }
-    for path in foreign:
-        (branch / path).write_text("kind: Secret\n")
-    (branch / EDGE / "README.md").write_text("text\n")
-    ran = check()
-    assert (ran.code, ran.out) == (1, "")
-    told = dict(line.removeprefix("error: ").split(": ", 1) for line in ran.err.splitlines())
-    generated = dict.fromkeys(("bootstrap/c-its.yaml", DETECTION, CLIENT), "is generated")
-    assert {path: re.split("[,;]", text)[0] for path, text in told.items()} == generated | foreign
-    assert "delete its claims in ledger/, or deny it by an override" in told[DETECTION]
-    assert "change demandops.yaml, inventory/ or policy/ instead" in told["bootstrap/c-its.yaml"]
 
 
 def test_git_runs_no_program_of_the_checkout_and_writes_nothing_into_it(

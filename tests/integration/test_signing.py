@@ -1,4 +1,7 @@
-"""The real git accepts commits signed with an SSH key, and `verify` reports on signatures."""
+"""The real git accepts commits signed with an SSH key, and `verify` reports on signatures.
+
+More is in ``stories/signing.yaml``.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,6 @@ import stat
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pygit2
 import pytest
@@ -18,9 +20,9 @@ from demandops.repo.git.signing import Signer, SigningFailed
 
 from tests.integration.conftest import On
 from tests.kit import rig
-from tests.kit.cli import Ran, Run
+from tests.kit.cli import Ran
 from tests.kit.goals import Goal, connection, goal
-from tests.kit.repo import FORGER, GitRepo, Person, branches, git
+from tests.kit.repo import FORGER, GitRepo, branches, git
 
 SIGNERS = "policy/allowed-signers"
 Book = Callable[..., Ran]
@@ -91,39 +93,6 @@ def test_git_accepts_the_signature_of_a_file_or_an_agent(
     git(state, "fsck", "--strict")
 
 
-@pytest.mark.usefixtures("git_environment")
-def test_every_command_that_writes_signs(
-    on: On,
-    demandops: Run,
-    state: GitRepo,
-    person: Person,
-    key: Path,
-    git_accepts: Accepts,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("DEMANDOPS_SIGNING_KEY", str(key))
-    shutil.rmtree(state.path)
-    assert demandops("init", state.path, "--bare").code == 0
-    made = [state.tip]
-    for command in ("", "rollback main~1 -y -m x --drop-newer", "decommission -y vehicle00"):
-        on.book(link("a"))
-        made.append(state.tip)
-        assert on(*(command or "log").split()).code == 0
-        made.append(state.tip)
-    on.book(link("b"))
-    state.commit({next(iter(state.files("ledger/connections/"))): None})
-    on.book(link("c"))  # after a commit that carries out the person's
-    made += [state.tip, git(state, "rev-parse", "main~1")]
-    state.commit({next(iter(state.manifests())): None})
-    assert on("upgrade").code == 0
-    made.append(state.tip)
-    person.policy(approval="required")
-    on.book(link("d"))
-    made += branches(state.path)
-    assert len(set(made)) == 9
-    assert all(git_accepts(key, commit) for commit in made)
-
-
 def test_a_generator_without_a_key_warns_once_where_keys_are_listed(
     bare: Path, state: GitRepo, key: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -189,18 +158,6 @@ def replace_newest(state: GitRepo, content: bytes, signature: str) -> str:
 
 class TestVerify:
     @pytest.fixture
-    def rows(self, on: On, state: GitRepo) -> Callable[[int], list[dict[str, Any]]]:
-        """Return a function that verifies all commits since now, and returns their rows."""
-        first = state.tip
-
-        def verify(code: int) -> list[dict[str, Any]]:
-            ran = on("verify", f"{first}..main", "--output", "json")
-            assert ran.code == code
-            return list(ran.json())
-
-        return verify
-
-    @pytest.fixture
     def signed(self, book: Book, state: GitRepo, key: Path) -> pygit2.Commit:
         """Return the newest commit, which is signed with the key that is listed."""
         state.commit({SIGNERS: listed(key)})
@@ -217,25 +174,6 @@ class TestVerify:
             return str(row["signature"])
 
         return verified
-
-    def test_without_a_list_it_counts_and_with_one_every_later_commit_must_be_signed(
-        self, book: Book, on: On, rows: Any, state: GitRepo, key: Path, tmp_path: Path
-    ) -> None:
-        book("a", key)
-        book("b")
-        ran = on("verify", "main~2..main")
-        assert ran.code == 0
-        assert ran.out.splitlines()[-2:] == ["2 of 2 commits are verified", "1 of 2 are signed"]
-        state.commit({SIGNERS: listed(key)}, "Only signed commits\n")
-        book("good", key)
-        assert rows(0)[-1]["signer"] == "generator@example.org"
-        book("unsigned")
-        assert f"{state.tip[:10]} UNSIGNED  Join unsigned\n" in on("verify").out
-        book("another", keygen(tmp_path / "another"))
-        found = rows(1)
-        assert [row["holds"] for row in found] == [True] * 4 + [False] * 2
-        told = [row["signature"].partition(",")[0] for row in found[-2:]]
-        assert told == ["is not signed", "is signed"]
 
     def test_a_commit_cannot_vouch_for_itself(
         self, newest: Callable[[], str], state: GitRepo, key: Path, tmp_path: Path
@@ -291,26 +229,6 @@ class TestVerify:
         assert on.refused("verify").startswith(f"error: {told}")
         with pytest.raises(SigningFailed, match="ssh-keygen, which signs the commits, is missing"):
             Signer(key)
-
-    def test_a_signer_whose_name_has_odd_characters_stops_no_verification(
-        self, book: Book, rows: Any, state: GitRepo, key: Path
-    ) -> None:
-        state.commit({SIGNERS: listed(key).replace("@", "\u2028\u0085\x0b\x1c@")})
-        book("a", key)
-        book("b", key)
-        assert [row["holds"] for row in rows(0)] == [True, True, True]
-
-    def test_keys_may_change(
-        self, book: Book, rows: Any, state: GitRepo, key: Path, tmp_path: Path
-    ) -> None:
-        """For each commit, `verify` uses the list of keys that was in effect before it."""
-        new = keygen(tmp_path / "new")
-        for each in (key, new):
-            state.commit({SIGNERS: listed(each)})
-            book(each.name, each)
-        assert all(row["holds"] for row in rows(0))
-        book("c", key)
-        assert not rows(1)[-1]["holds"]
 
 
 def test_commits_are_signed_off_if_the_settings_name_who_does(on: On, state: GitRepo) -> None:

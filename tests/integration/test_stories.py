@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from string import Template
@@ -122,7 +123,9 @@ class Teller:
         words["branch"] = next(iter(branches(repo, "demand/", "override/")), "main")  # a proposal's
         words["head"] = git(repo, "rev-parse", words["branch"])
         words |= {"tip": self.repo.tip, "clone": str(self.clone), "folder": str(self._folder)}
-        step = Step.model_validate(_filled(told, words | self._names))
+        words |= self._keys(str(told))
+        names = {name: _filled(text, words) for name, text in self._names.items()}
+        step = Step.model_validate(_filled(told, words | names))
         self._names = self._names | step.notes
         send(repo, step.sends)
         if step.commits:
@@ -150,6 +153,19 @@ class Teller:
                 own.setenv(variable, value)
             if step.run:
                 self._check(step)
+
+    def _keys(self, told: str) -> dict[str, str]:
+        """Return the SSH keys that a step or its names use, which the first use makes."""
+        words = {}
+        for name in ("key", "other"):
+            file = self._folder / name
+            if f"${name}" in told and not file.exists():
+                make = ("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", str(file))
+                subprocess.run(make, check=True)
+            if file.exists():
+                public = file.with_suffix(".pub").read_text()
+                words |= {name: str(file), f"{name}_public": public}
+        return words
 
     def _check(self, step: Step) -> None:
         args, before = shlex.split(step.run), self.repo.tip

@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pygit2
 import pytest
 import yaml
 from demandops.base.errors import StateRepoError
@@ -104,29 +103,6 @@ def verified(on: On) -> list[str]:
 
 
 # ---- the other controller ----
-
-
-def test_all_goes_over_in_one_commit_and_back_and_verifies(on: On, state: GitRepo) -> None:
-    on.book(perception())
-    flux, tip = state.files(), state.tip
-    said = on.json("upgrade", "--gitops", "argocd")
-    assert (said["outcome"], said["commit"]) == ("upgraded", state.tip)
-    assert said["gitops"] == {"from": "flux", "to": "argocd"}
-    assert pygit2.Repository(str(state.path))[state.tip].parents[0].id == pygit2.Oid(hex=tip)  # type: ignore[attr-defined]
-    argocd = state.files()
-    assert said["written"] == sorted(p for p in argocd if argocd[p] != flux.get(p))
-    assert said["removed"] == sorted(flux.keys() - argocd.keys())
-    kinds = {yaml.safe_load(text.split("---")[0])["kind"] for text in state.manifests().values()}
-    assert "Application" in kinds and "HelmRelease" not in kinds
-    assert verified(on) == [None]
-
-    assert on("upgrade", "--gitops", "flux").code == 0
-    back = state.files()
-    assert back[ROOT_FILE] == f"{flux[ROOT_FILE]}\nargocd:\n  url: {URL}\n"
-    assert {p: t for p, t in back.items() if p != ROOT_FILE} == {
-        p: t for p, t in flux.items() if p != ROOT_FILE
-    }
-    assert verified(on) == [None]
 
 
 def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(state: GitRepo) -> None:

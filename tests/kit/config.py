@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -58,10 +57,3 @@ def override(*select: Mapping[str, Any], **fields: Any) -> str:
     head = {"apiVersion": "demandops/v1", "kind": "Override"}
     why = {"reason": "a field test", "owner": "petra"}
     return yaml.safe_dump(head | why | {"select": list(select)} | fields, sort_keys=False)
-
-
-def patches_commute(first: object, second: object) -> bool:
-    if isinstance(first, Mapping) and isinstance(second, Mapping):
-        return all(patches_commute(first[key], second[key]) for key in first if key in second)
-    # unlike ==, JSON distinguishes 1 from True
-    return json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)

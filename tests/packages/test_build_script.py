@@ -20,6 +20,7 @@ INTERFACES = Path(__file__).resolve().parents[2] / "ros_bridge" / "interfaces"
 BUILD = INTERFACES / "build.py"
 TOOLS = plain_yaml.load(Path(__file__).with_name("tools.yaml").read_text())
 OURS = "application_manager_interfaces"
+FOLDERS = Path(__file__).resolve().parents[1] / "fixtures" / "messages"
 
 
 def test_nothing_changed_is_seen_without_a_compiler() -> None:
@@ -40,13 +41,18 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     spec = importlib.util.spec_from_file_location("interfaces_build", copy / "build.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, spec.name, module)  # its dataclass looks there
     spec.loader.exec_module(module)
 
     (prefix / "include").mkdir(parents=True)
     (prefix / "include" / "Python.h").touch()
+    for wheel in ("geometry_msgs", "std_msgs"):
+        (prefix / "share" / wheel / "msg").mkdir(parents=True)
     monkeypatch.setattr(sysconfig, "get_path", lambda name: str(prefix / name))
     record = prefix / "share" / "demandops" / "interfaces.json"
-    names = {"PREFIX": prefix, "SITE": prefix / "site", "RECORD": record, "VERIFY": ""}
+    kept = record.with_name("messages")
+    names = {"PREFIX": prefix, "SITE": prefix / "site", "RECORD": record, "KEPT": kept}
+    names["VERIFY"] = ""
     for name, value in names.items():
         monkeypatch.setattr(module, name, value)
     for wheel in module.WHEELS:
@@ -72,16 +78,20 @@ def calls(script: ModuleType) -> list[str]:
     return lines
 
 
-ALL = ["configure", "configure", "--build", "--build", "--install", "--install"]
+MADE = ["--build", "--install"]
+ALL = ["configure", "configure", *MADE, *MADE, "configure", *MADE]
 
 
 def test_it_builds_once(script: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     assert script.main() == 0
     assert calls(script) == ALL
     stages = [line.rsplit(": ", 1)[0] for line in capsys.readouterr().out.splitlines()]
-    in_turn = ["configure", "configure", "build", "build", "install", "install"]
-    assert [stage.split()[0] for stage in stages] == [*in_turn, "verify"]
-    assert {" ".join(stage.split()[1:]) for stage in stages[:-1]} == {*script.PACKAGES}
+    made = ["build", "install", "verify"]
+    assert [stage.split()[0] for stage in stages] == [
+        *("configure", "configure", *made, *made),
+        *("configure", *made),
+    ]
+    assert {" ".join(stage.split()[1:]) for stage in stages} == {*script.PACKAGES, "tf2_msgs"}
 
     assert script.main() == 0
     assert calls(script) == []
@@ -90,18 +100,76 @@ def test_it_builds_once(script: ModuleType, capsys: pytest.CaptureFixture[str]) 
 
 def test_it_builds_again_after_a_change(script: ModuleType) -> None:
     wheels = [script.SITE / f"ros_rclpy-1.{number}.dist-info" for number in (0, 1)]
-    changes: list[Callable[[], object]] = [
-        lambda: None,
-        lambda: (script.SOURCES / OURS / "msg" / "Topic.msg").write_text("string name\n"),
-        lambda: wheels[0].rename(wheels[1]),
-        lambda: (script.SOURCES / "wheels.cmake").write_text(""),
-        (script.PREFIX / "lib" / f"lib{OURS}__typesupport.so").unlink,
-        lambda: script.RECORD.write_text("{"),
+    one = ["configure", *MADE]
+    changes: list[tuple[Callable[[], object], list[str]]] = [
+        (lambda: None, ALL),
+        (lambda: (script.SOURCES / OURS / "msg" / "Topic.msg").write_text("string name\n"), one),
+        (lambda: wheels[0].rename(wheels[1]), ALL),
+        (lambda: (script.SOURCES / "wheels.cmake").write_text(""), ALL),
+        ((script.PREFIX / "lib" / f"lib{OURS}__typesupport.so").unlink, one),
+        (lambda: script.RECORD.write_text("{"), ALL),
+        (lambda: script.RECORD.write_text('{"digest": "", "files": []}'), ALL),
     ]
-    for change in changes:
+    for change, made in changes:
         change()
         assert script.main() == 0
-        assert calls(script) == ALL
+        assert calls(script) == made
+
+
+def test_folders_of_messages_are_built_after_what_they_need_and_kept(
+    script: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert script.main() == 0
+    calls(script)
+    given = shutil.copytree(FOLDERS, tmp_path / "given")
+    assert script.main(str(given)) == 0
+    assert calls(script) == ["configure", *MADE] * 2
+    built = [line.split()[1] for line in capsys.readouterr().out.splitlines()[-8:]]
+    assert built == ["fleet_msgs:"] * 4 + ["hazard_msgs:"] * 4
+    (given / "fleet_msgs" / "msg" / "Motion.msg").write_text("float64[] state\n")
+    for folders, made in (((), 0), ((str(given / "fleet_msgs"),), 2), ((), 0)):
+        assert script.main(*folders) == 0
+        assert calls(script) == ["configure", *MADE] * made
+
+
+REFUSED = {
+    "empty": ({}, "given: has no file msg/*.msg; name the folder of an interface package"),
+    "a name": ({"Fleet;msgs/msg/A.msg": ""}, "'Fleet;msgs' is no name of a package"),
+    "a message": ({"a_msgs/msg/a b.msg": ""}, "a b.msg: is no name of a message; write it like"),
+    "a wheel's": (
+        {"ros_msgs/package.xml": "<name> rclpy </name>", "ros_msgs/msg/A.msg": ""},
+        "ros_msgs: rclpy is installed already",
+    ),
+    "ours": ({f"{OURS}/msg/A.msg": ""}, f"{OURS} is installed already; leave it out"),
+    "twice": ({"x/a_msgs/msg/A.msg": "", "y/a_msgs/msg/A.msg": ""}, "is named a_msgs, like"),
+    "unknown": (
+        {"a_msgs/msg/A.msg": "# b_msgs/B b\nc_msgs/C c\n"},
+        "a_msgs: needs c_msgs, which is not installed; give its folder too",
+    ),
+    "circle": (
+        {"a_msgs/msg/A.msg": "b_msgs/B b", "b_msgs/msg/B.msg": "a_msgs/A a"},
+        "a_msgs and b_msgs: need each other's messages",
+    ),
+}
+
+
+@pytest.mark.parametrize(("files", "told"), REFUSED.values(), ids=REFUSED)
+def test_a_folder_that_cannot_be_built_is_refused_before_anything_is_built(
+    files: dict[str, str],
+    told: str,
+    script: ModuleType,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given = tmp_path / "given"
+    given.mkdir()
+    for name, text in files.items():
+        path = given / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    assert script.main(str(given)) == 1
+    assert told in capsys.readouterr().err
+    assert calls(script) == []
 
 
 def test_it_removes_what_an_earlier_build_installed(script: ModuleType) -> None:

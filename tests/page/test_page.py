@@ -143,14 +143,6 @@ def test_the_first_view_tells_why_since_when_and_who(visit: Visits) -> None:
     expect(cause).to_contain_text("edge/object_detection_fusion")
 
 
-def test_a_commit_is_on_the_page_at_once(visit: Visits, fleet: Story) -> None:
-    """The page changes because of an event; the benchmark measures how long that takes."""
-    page = visit().open("/demands")
-    expect(page.locator("#live")).to_have_text("live")
-    book(fleet.generator, leased("arrival", "vehicle02", "40m"))
-    expect(page.locator("main")).to_contain_text("arrival")
-
-
 def test_an_update_of_the_page_keeps_the_focus_and_the_typed_text(
     visit: Visits, fleet: Story
 ) -> None:
@@ -188,14 +180,8 @@ def test_a_keyboard_reaches_everything(visit: Visits) -> None:
         if page.evaluate("document.activeElement.classList.contains('node')"):
             break
     page.keyboard.press("Enter")
-    page.wait_for_url("**/thing?**")
-
-
-def test_a_node_of_the_map_links_to_its_page(visit: Visits) -> None:
-    page = visit().open("/map")
-    page.locator(".node", has_text="edge").first.click()
-    page.wait_for_url("**/thing?kind=node&name=edge")
-    expect(page.locator("h1")).to_contain_text("Node edge")
+    page.wait_for_url("**/thing?kind=node&**")
+    expect(page.locator("h1")).to_contain_text("Node ")
 
 
 def test_a_dot_of_the_time_line_opens_the_books_of_then(visit: Visits) -> None:

@@ -15,8 +15,10 @@ from demandops_ros.detector.detector_node import read_bookkeeping
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 
+from tests.kit.cli import Run
 from tests.kit.detection import POSE, text_of
 from tests.kit.goals import put
+from tests.kit.live import Step, heard_live, told
 from tests.kit.repo import git
 from tests.kit.ros import Client, Serve, Servers
 
@@ -99,3 +101,41 @@ def test_bookkeeping_that_cannot_be_read_is_told_and_is_not_used(
     assert read_bookkeeping('{"demands": {}}', file) == {"demands": {}}
     assert [record.levelname for record in caplog.records] == ["WARNING"] * len(odd)
     assert all("the bookkeeping cannot be read (" in line for line in caplog.messages)
+
+
+SITE, TF = "site", "tf2_msgs/msg/TFMessage"
+
+
+def frame(child: str, parent: str, x: float) -> dict[str, Any]:
+    """Return a message of /tf: the origin of ``child`` is at ``x`` in ``parent``, turned by 90°."""
+    rotation = {"x": 0.0, "y": 0.0, "z": 0.5**0.5, "w": 0.5**0.5}
+    transform = {"translation": {"x": x, "y": 0.0, "z": 0.0}, "rotation": rotation}
+    head = {"header": {"frame_id": parent}, "child_frame_id": child}
+    return {"transforms": [head | {"transform": transform}]}
+
+
+def test_positions_in_frames_of_tf_give_the_same_events_live_and_from_a_bag(
+    demandops: Run, tmp_path: Path, ros_domain: int
+) -> None:
+    rules = tmp_path / "rules.yaml"
+    point = {"x": 980.0, "y": 0.0}
+    near = {"source": "vehicles", "point": point, "start": 84, "stop": 90}
+    rules.write_text(rules_of(near=near) + "map: {frame: map}\n")
+
+    def pose(vehicle: str, frame: str) -> Step:
+        fields = {"header": {"frame_id": frame}, "pose": {"position": {"x": 20.0}}}
+        return f"/vehicles/{vehicle}/pose", POSE, fields
+
+    steps: list[Step] = [pose("v1", "v1/base")] * 3  # nothing tells where that is
+    steps += [("/tf_static", TF, frame(SITE, "map", 1000.0)), pose("v1", "v1/base")]
+    for away in (100.0, 80.0, 89.0, 91.0, 80.0):
+        steps += [("/tf", TF, frame("v1/base", SITE, away)), pose("v1", "v1/base")]
+        steps += [pose("v2", "v2/base")]
+    log = heard_live(rules, steps, 3, ros_domain)
+    left_out = "in the frame 'v{}/base' are left out, because nothing on /tf or /tf_static leads"
+    assert [log.count(left_out.format(number)) for number in (1, 2)] == [1, 1]
+    # the x of the site is the y of the map, and ahead of the base is where x of the map falls
+    events = [f"rule near: v1 is {away:.1f} m from the area" for away in (80, 91, 80)]
+    assert told(log) == events
+    replayed = demandops("detect", rules, "--replay", rules.with_name("bag"), "--output", "json")
+    assert [f"rule {one['rule']}: {one['reason']}" for one in replayed.json()["events"]] == events

@@ -75,7 +75,8 @@ def arguments(member: Any) -> str:
 def interfaces() -> Json:
     """Return the fields of each action, message and service."""
     found = {}
-    for path in sorted(INTERFACES.rglob("*.*")):
+    packages = [path.parent for path in INTERFACES.glob("*/package.xml")]
+    for path in sorted(path for package in packages for path in package.rglob("*.*")):
         if path.suffix in (".action", ".msg", ".srv"):
             lines = (line.partition("#")[0].split() for line in path.read_text().splitlines())
             name = f"{path.relative_to(INTERFACES).parts[0]}/{path.stem}"

@@ -94,11 +94,16 @@ def _inputs(outcome: Outcome) -> Iterator[str]:
             seen = seen[seen.index(wanted) + 1 :]
         else:
             yield f"after '{formed}', the fusion never read {sorted(wanted)}"
-    fusions = [pod for pod in outcome.pods if pod.service == FUSION]
-    starts = [len(container.starts) for pod in fusions for container in pod.containers]
+    yield from restarts(outcome, FUSION)
+
+
+def restarts(outcome: Outcome, service: str) -> Iterator[str]:
+    """Yield a text if a service that all demands share did not run just while one lasted."""
+    pods = [pod for pod in outcome.pods if pod.service == service]
+    starts = [len(container.starts) for pod in pods for container in pod.containers]
     periods = _busy_periods([formed.joins for formed in outcome.formed])
-    if len(fusions) != periods or set(starts) != {1}:
-        yield f"{len(fusions)} pods in place of {periods}, with {starts} starts of containers"
+    if len(pods) != periods or set(starts) != {1}:
+        yield f"{len(pods)} pods in place of {periods}, with {starts} starts of containers"
 
 
 def _busy_periods(joins: Iterable[bool]) -> int:
@@ -131,11 +136,12 @@ def check_nodes(outcome: Outcome) -> Iterator[str]:
     """Yield a text for each pod that did not run on its own node."""
     for pod in outcome.pods:
         kind, *rest = pod.service.split("-")
-        is_first = kind in ("od", "of", "zenoh") or rest[2] == "source"
-        wanted = rest[0] if is_first else rest[1]
+        wanted = rest[:1]
+        if kind == "mqtt":  # the name of a derived connection's client does not say which end it is
+            wanted = rest[1:3] if rest[0] == "derived" else rest[rest[2] != "source" :][:1]
         node = outcome.node_ids.get(pod.node, pod.node)
-        if node != wanted:
-            yield f"{pod.service} ran on {node}, not on {wanted}"
+        if node not in wanted:
+            yield f"{pod.service} ran on {node}, not on {' or '.join(wanted)}"
 
 
 def _fused(outcome: Outcome) -> Iterator[str]:

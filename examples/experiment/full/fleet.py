@@ -82,7 +82,8 @@ def is_client(service: str, vehicle: str, carrier: Carrier) -> bool:
     """Return whether a service is a client for this vehicle's connection to the edge alone."""
     if carrier == "zenoh":
         return service == f"zenoh-{vehicle}"
-    return service.startswith(f"mqtt-{vehicle}-edge")
+    ends = service.removeprefix("mqtt-").removeprefix("derived-")
+    return ends != service and ends.startswith(f"{vehicle}-edge-")
 
 
 def initial_deployment(vehicles: Collection[str]) -> dict[str, Any]:

@@ -78,7 +78,8 @@ class Outcome:
     inputs: list[tuple[float, frozenset[str]]] = field(default_factory=list)
     tracks: list[tuple[float, list[tuple[float, float]]]] = field(default_factory=list)
     arrivals: dict[str, list[float]] = field(default_factory=dict)
-    delivered: dict[str, list[float]] = field(default_factory=dict)
+    # what came back, by topic and vehicle
+    delivered: dict[str, dict[str, list[float]]] = field(default_factory=dict)
     carried: dict[str, int] = field(default_factory=dict)
     crossings: tuple[Near, ...] = ()
     """All intersections of the larger experiment; empty in the paper's experiment."""
@@ -208,9 +209,10 @@ def _payload(outcome: Outcome) -> dict[str, int]:
     """Return how many bytes of each topic were carried to the edge, by its name at the source."""
     found: defaultdict[str, int] = defaultdict(int)
     for topic, size in outcome.carried.items():
-        if not topic.startswith(("mqtt_client/", "$SYS/")):
-            _, _, ros_topic = topic.partition("/")
-            found[f"/{ros_topic}"] += size
+        ros_topic = "/" + topic.partition("/")[2]
+        is_own = topic.startswith(("mqtt_client/", "$SYS/"))
+        if ros_topic in outcome.published and not is_own:  # else it comes from the edge
+            found[ros_topic] += size
     return dict(found)
 
 

@@ -30,6 +30,7 @@ _SILENCE_S = 0.6
 _PAPER = ("0", "1", "3", "2", "-0", "-1", "-2", "-3")
 """The order of events in the paper: `0` means that vehicle 0 joins, `-0` that it leaves."""
 _SHORTEST_STAY = 3  # slots
+_TOGETHER = 4
 _JITTER = 0.2  # of a slot
 _ARMS = tuple(math.radians(degrees) for degrees in (0, 90, 180, 270))
 
@@ -139,25 +140,36 @@ def one(seed: int, gap: float) -> tuple[Route, ...]:
 
 def many(seed: int, count: int) -> tuple[Route, ...]:
     """Return routes through ``MIDDLES``; every ``SPACING_S`` s one enters, at 20 to 50 km/h."""
-    return passing(seed, [f"vehicle{number:03}" for number in range(count)], SPACING_S, MIDDLES)
-
-
-def passing(
-    seed: int,
-    vehicles: Sequence[str],
-    spacing: float,
-    middles: Sequence[tuple[float, float]] = MIDDLES[:1],
-) -> tuple[Route, ...]:
-    """Return routes of vehicles that enter one after the other, ``spacing`` seconds apart."""
     chance = random.Random(seed)
     found = []
-    for number, vehicle in enumerate(vehicles):
-        enters = (number + 1 + chance.uniform(-_JITTER, _JITTER)) * spacing
+    for number in range(count):
+        enters = (number + 1 + chance.uniform(-_JITTER, _JITTER)) * SPACING_S
         leaves = enters + 2 * RADIUS_M / (chance.uniform(20, 50) / 3.6)
         arms = chance.sample(_ARMS, 2)
-        middle = chance.choice(middles)
-        found.append(Route(vehicle, enters, leaves, *arms, middle=middle))
+        middle = chance.choice(MIDDLES)
+        found.append(Route(f"vehicle{number:03}", enters, leaves, *arms, middle=middle))
     return tuple(found)
+
+
+def crowd(seed: int, gap: float, vehicles: Sequence[str]) -> tuple[Route, ...]:
+    """Return routes of any number of vehicles, of which at most ``_TOGETHER`` are near at once."""
+    chance = random.Random(seed)
+    coming, slot = list(vehicles), 0
+    inside: dict[str, int] = {}
+    spans: dict[str, tuple[int, int]] = {}
+    while coming or inside:
+        long_there = [name for name, since in inside.items() if slot - since >= _SHORTEST_STAY]
+        if coming and len(inside) < _TOGETHER and (not long_there or chance.random() < 0.6):
+            inside[coming.pop(0)] = slot
+        elif long_there:
+            name = chance.choice(long_there)
+            spans[name] = (inside.pop(name), slot)
+        slot += 1
+    moment = {at: (at + 1 + chance.uniform(-_JITTER, _JITTER)) * gap for at in range(slot)}
+    return tuple(
+        Route(name, moment[enters], moment[leaves], *chance.sample(_ARMS, 2))
+        for name, (enters, leaves) in sorted(spans.items(), key=lambda item: item[1])
+    )
 
 
 def vanishing(routes: Sequence[Route], vehicle: str) -> tuple[Route, ...]:

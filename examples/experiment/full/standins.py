@@ -14,7 +14,7 @@ import sys
 from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import rclpy
 from demandops_ros.ros_process import ExecutorThread, StopSignals
@@ -26,7 +26,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 
-PROGRAMS = ("ros2", "zenoh-bridge-ros2dds")
+PROGRAMS = ("ros2", "zenoh-bridge-ros2dds", "demandops")
 
 
 def image(folder: Path) -> Path:
@@ -335,19 +335,26 @@ OURS = ("demandops_ros", "parameter_sync.launch.xml")
 
 
 def main(program: str, *arguments: str) -> None:
-    """Run the program of our own launch file, or the stand-in for one of the reference."""
-    if program != PROGRAMS[0]:
+    """Run our own program or an installed node, or the stand-in for one of the reference."""
+    if program == "zenoh-bridge-ros2dds":
         carry_by_zenoh([*arguments])
         return
-    launch, package, file, *rest = arguments
-    assert launch == "launch", launch
+    if program == "demandops":
+        _become("-m", "demandops.cli.main", *arguments)
+    command, package, file, *rest = arguments
+    if command == "run":
+        _become(str(Path.cwd() / package / file), *rest)
+    assert command == "launch", command
     given = dict(argument.split(":=", 1) for argument in rest)
     if (package, file) == OURS:
         # what the launch file runs; ROS's `launch` itself does not come as a Python wheel
         ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params"]]
-        command = [sys.executable, "-m", "demandops.cli.main", "parameter-sync", "--ros-args"]
-        os.execv(sys.executable, [*command, *ros_args])  # noqa: S606 - no shell on purpose
+        _become("-m", "demandops.cli.main", "parameter-sync", "--ros-args", *ros_args)
     _LAUNCHED[package, file](given)
+
+
+def _become(*arguments: str) -> NoReturn:
+    os.execv(sys.executable, [sys.executable, *arguments])  # noqa: S606 - no shell on purpose
 
 
 if __name__ == "__main__":

@@ -182,6 +182,7 @@ PATTERN_WORDS = {
         f"{_ANY}, '_', '.' and '-', but no '.' or '-' first, such as ca.crt"
     ),
     r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$": "the tag of an image, such as v1.2.0",
+    r"^[A-Za-z0-9_][A-Za-z0-9_./-]*$": "a frame of /tf, such as map or vehicle01/odom",
     r"^[A-Z]+:[0-9]+$": "the code of a map's coordinates, such as EPSG:25832",
     r"^[A-Z][A-Za-z0-9]*$": "a kind of Kubernetes object, such as ConfigMap",
     r"^([a-z0-9]([a-z0-9.-]*[a-z0-9])?)?$": "the group of an API, such as batch, or nothing",

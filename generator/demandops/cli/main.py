@@ -36,7 +36,7 @@ COMMANDS = {
     "demand": "Demand what files ask for: book it, or send it to a node.",
     "detect": "Watch topics, and send the demands that rules ask for.",
     "diff": "Show the differences between two commits.",
-    "drain": "Take a node out of use: nothing new is placed there.",
+    "drain": "Take a node out of use: the generator places nothing there.",
     "get": "List demands, releases, nodes, overrides and so on.",
     "init": "Create a state repo.",
     "journal": "List the accepted demands that are not published.",
@@ -93,24 +93,32 @@ ALIASES = {
 
 # What is meant by words of other programs.
 _LEADS = {
-    "check": "lint plan template validate",
-    "demand FILE": "apply create install",
+    "check": "lint, plan, template, validate",
+    "demand FILE": "apply, create, install",
     "drain NODE": "cordon",
-    "get KIND": "list ls ps top",
+    "get KIND": "list, ls, ps, top",
+    "get overrides": "override get, override list, override ls",
+    "get releases": "get deployments, get pods, deployments, pods",
     "log": "history",
-    "may REQUESTER demand APPLICATION": "auth can-i",
-    "override create NAME --on NODE": "move",
-    "override create NAME --refuse-new --until 2h": "freeze",
+    "may REQUESTER demand APPLICATION": "auth, can-i",
+    "override create NAME": "override add, override new",
+    "override create NAME --on NODE": "migrate, move",
     "override create NAME --replicas N": "scale",
     "override create NAME --use-version VERSION, or with --image NAME=TAG": "pin",
-    "override create NAME --values FILE": "edit patch",
+    "override create NAME --values FILE": "edit, patch",
+    "override create freeze --node '*' --refuse-new --until 1h -m \"why\"": "freeze",
+    "override end NAME": "override delete, override remove, override rm, override stop",
+    "override end freeze": "thaw, unfreeze",
     "reconcile CLUSTER": "sync",
-    "release DEMAND|APPLICATION": "cancel delete remove rm stop uninstall",
+    "reject PROPOSAL -m REASON": "decline, deny, refuse",
+    "release DEMAND|APPLICATION": "cancel, delete, remove, rm, stop, uninstall",
     "revert COMMIT": "undo",
-    "rollback TIME": "restore rollout",
-    "suspend --application ID": "disable pause",
+    "rollback TIME": "restore, rollout",
+    "status": "health",
+    "suspend --application ID": "disable, pause",
     "undrain NODE": "uncordon",
-    "why NAME": "explain logs show trace tree",
+    "verify 2000-01-01..main": "audit, verify --all",
+    "why NAME": "explain, logs, show, trace, tree",
 }
 
 # These commands run until they are stopped. They log or fill the screen, so they do not show the
@@ -168,11 +176,24 @@ class _LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         args = [*ALIASES.get(args[0], args[:1]), *args[1:]]
-        if (word := args[0]) not in COMMANDS and not word.startswith("-"):
+        word, both = args[0], " ".join(args[:2])
+        is_unknown = word not in COMMANDS and not word.startswith("-")
+        told = {both, word} if is_unknown else {both}
+        meant = next((lead for lead, words in _LEADS.items() if told & {*words.split(", ")}), "")
+        if meant or is_unknown:
+            kinds = import_module("demandops.views.kinds").KINDS
+            meant = meant or next(
+                (f"get {name}" for name in kinds if word in (name, name[:-1])), ""
+            )
             hint = suggestion(word, [*COMMANDS, *ALIASES]).replace("known:", "the commands are:")
-            if meant := next((lead for lead, words in _LEADS.items() if word in words.split()), ""):
-                hint = f"; did you mean: demandops {meant}"
-            ctx.fail(f"there is no command '{word}'{hint}")
+            hint = f"; did you mean: demandops {meant}" if meant else hint
+            ctx.fail(f"there is no command '{word if is_unknown else both}'{hint}")
+        if word == "why" and len(args) > 2 and not any(arg.startswith("-") for arg in args[1:3]):
+            args[1:3] = [
+                args[2],
+                "--kind",
+                args[1].lower().removesuffix("s"),
+            ]  # as `kubectl describe` names things
         name, command, arguments = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
             child_processes.listeners[:] = [show_slow]

@@ -273,12 +273,13 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     REV names one commit, A..B the commits after A up to B; default: the newest commit. REV, A and B
     are commits or times. Once the state repo has policy/allowed-signers, each further commit of the
     generator must have a good signature. The version of this file in the commit's parent must list
-    the signing key (docs/audit.md).
+    the signing key (docs/audit.md). People's commits are skipped: nothing proves who made them,
+    unless they are signed. The exit code is 1 if a commit fails, or if none is verified.
 
     \b
     Examples:
       demandops verify
-      demandops verify main~50..main
+      demandops verify 1d..main
       demandops verify main --whole
     """
     # what was rendered once must not fail here because this machine is slower
@@ -309,13 +310,20 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     skipped = sum(bool(verdict.skipped and verdict.holds) for verdict in verdicts)
     verified = sum(verdict.holds for verdict in verdicts) - skipped
     note = f", {skipped} skipped" if skipped else ""
-    lines.append(f"{verified} of {len(verdicts)} commits are verified{note}")
+    number = verified or (skipped and "NONE")  # which must not look like success
+    lines.append(f"{number} of {len(verdicts)} commits are verified{note}")
+    good = sum(bool(verdict.signer) for verdict in verdicts)
     if signed := sum(verdict.signed for verdict in verdicts):
-        good = sum(bool(verdict.signer) for verdict in verdicts)
         listed = f", {good} by keys that policy/allowed-signers lists" if good else ""
         lines.append(f"{signed} of {len(verdicts)} are signed{listed}")
+    if verdicts and good < len(verdicts):
+        lines.append(
+            f"not proven: who made {len(verdicts) - good} of them, whose signatures are not "
+            "checked; to see at the next audit that none was rewritten: "
+            f"git merge-base --is-ancestor {verdicts[-1].commit} main"
+        )
     show(output, rows, lines)
-    if not all(verdict.holds for verdict in verdicts):
+    if not all(verdict.holds for verdict in verdicts) or (verdicts and not verified):
         raise click.exceptions.Exit(1)
 
 

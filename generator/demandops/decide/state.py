@@ -78,6 +78,17 @@ class State(World):
         object.__setattr__(state, "_names", names)
         return state
 
+    def with_nodes(self, config: Config) -> State:
+        """Return the state with nodes that differ only in what a choice of nodes depends on.
+
+        Nothing that runs differs, so all that was counted of it stays valid.
+        """
+        state = replace(self, config=config)
+        object.__setattr__(state, "_names", self._names)
+        if config.limits_capacity == self.config.limits_capacity:
+            object.__setattr__(state, "_usage", self._usage)
+        return state
+
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
         state, changes = replace(self, ledger=ledger), tuple(changes)
         # If a definition is gone, ``names`` and ``usage`` look at all releases again.

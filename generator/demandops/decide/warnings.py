@@ -337,7 +337,7 @@ def live_warnings(state: State) -> Iterator[Fault]:
             if name not in known and not written:
                 problem = (
                     f"'{name}' is no value that {service.values} writes or the chart "
-                    f"'{service.chart}' has{suggestion(name, known)}; correct it, or remove it"
+                    f"'{service.chart}' has; correct it, or remove it{suggestion(name, known)}"
                 )
             elif name == "parameters" and known.get("reconfigure") == "restart":
                 problem = (

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from math import floor, hypot, inf, isfinite
+from math import floor, hypot, inf
 from statistics import median
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
-from demandops.base.placeholders import VALUE
 from demandops.detect.condition import Count, Hours, Near, Threshold, Together
 from demandops.detect.rule_file import Rule, RuleFile, Who
 from demandops.model.config.base_model import seconds_of
@@ -27,6 +25,7 @@ Key: TypeAlias = tuple[str, tuple[str, ...]]
 Cell: TypeAlias = tuple[str, str, int, int]
 
 _NOTHING: Mapping[Any, Any] = MappingProxyType({})
+_NOBODY: frozenset[str] = frozenset()
 
 
 class Observation(NamedTuple):
@@ -90,7 +89,7 @@ class State:
     counted: dict[Who, frozenset[str]] = field(default_factory=dict)
     # How many entities a rule counts, by the name of the rule.
     counts: dict[str, int] = field(default_factory=dict)
-    # The entities in each square, for rules on pairs.
+    # The entities in and around each square, for rules on pairs.
     cells: dict[Cell, frozenset[str]] = field(default_factory=dict)
 
     def copied(self) -> State:
@@ -122,97 +121,6 @@ class State:
         )
 
 
-# ---- reads which entity a message is about, where the entity is, and which values it reports ----
-#
-# A message may be any object with attributes, so messages of rclpy and of a recorded bag are read
-# alike.
-
-_FARTHEST_M = 1e9
-_PART = re.compile(r"(\w+)|\[(\d+)\]")
-
-Getter = Callable[[Any], Any]
-
-
-class Unreadable(Exception):
-    """Raised for a message that cannot be used; the error's text is one line."""
-
-
-class MessageReader:
-    """Reads the messages of one source, and of these only the fields that rules need."""
-
-    def __init__(self, file: RuleFile, source: str) -> None:
-        definition = file.sources[source]
-        self._source = source
-        self._entity = definition.entity and _getter(definition.entity)
-        self._place, self._map = definition.position, file.map
-        self._position = self._place and (_getter(self._place.first), _getter(self._place.second))
-        unavailable = self._place.unavailable if self._place else definition.unavailable
-        self._unavailable = [(_getter(field), number) for field, number in unavailable.items()]
-        thresholds = (rule.threshold for rule in file.rules)
-        fields = {limits.field for limits in thresholds if limits and limits.source == source}
-        self._fields = {field: _getter(field) for field in sorted(fields)}
-
-    def observation(
-        self,
-        message: Any,  # noqa: ANN401
-        entity: str,
-        at: float,
-    ) -> Observation | None:
-        """Return what a message reports, ``None`` if it says that the position is not known.
-
-        ``entity`` is from the topic, empty if a field has it.
-        """
-        for get, number in self._unavailable:
-            if _number(get(message)) == number:
-                return None
-        if self._entity:
-            entity = str(self._entity(message)).strip("/")
-            if not re.fullmatch(VALUE, entity):
-                raise Unreadable(f"{entity[:60]!r} is not a name of an entity")
-        position = None
-        if self._position and self._place:
-            x, y = (_number(get(message)) for get in self._position)
-            if self._map and self._place.in_degrees:
-                x, y = self._metres(x * self._place.scale, y * self._place.scale)
-            if abs(x) > _FARTHEST_M or abs(y) > _FARTHEST_M:
-                raise Unreadable(f"the position is more than {_FARTHEST_M:g} m from the origin")
-            position = x, y
-        values = {field: _number(get(message)) for field, get in self._fields.items()}
-        return Observation(self._source, entity, at, position, values)
-
-    def _metres(self, latitude: float, longitude: float) -> tuple[float, float]:
-        is_on_earth = abs(latitude) <= 90 and abs(longitude) <= 180
-        metres = self._map.metres(latitude, longitude) if self._map and is_on_earth else None
-        if metres is None:
-            raise Unreadable(f"latitude {latitude:g}, longitude {longitude:g} is not on the map")
-        return metres
-
-
-def _number(value: object) -> float:
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        raise Unreadable(f"{str(value)[:60]!r} is not a number") from None
-    if not isfinite(number):
-        raise Unreadable(f"{number} is not a finite number")
-    return number
-
-
-def _getter(path: str) -> Getter:
-    parts = [(name, int(index or 0)) for name, index in _PART.findall(path)]
-
-    def get(message: Any) -> Any:  # noqa: ANN401
-        value = message
-        try:
-            for name, index in parts:
-                value = getattr(value, name) if name else value[index]
-        except (AttributeError, IndexError, TypeError):
-            raise Unreadable(f"the message has no field {path}") from None
-        return value
-
-    return get
-
-
 # ---- an index of pairs by position, so that an entity is compared only with those near it ----
 
 
@@ -223,7 +131,8 @@ def distance(last: Observation, other: Observation) -> float:
 
 class Pairs:
     # The map is divided into squares as wide as the distance at which the condition stops. So all
-    # partners of an entity are in the entity's square and the squares around it.
+    # partners of an entity are in the entity's square and the squares around it. An entity is noted
+    # in all nine, because it seldom changes its square: one look then finds its partners.
 
     def __init__(self, rule: Rule, condition: Together) -> None:
         self.rule, self.condition = rule, condition
@@ -254,25 +163,33 @@ class Pairs:
         left, entered = self._cell(before), self._cell(after)
         if left == entered:
             return
-        if left is not None:
-            cells[left] = cells[left] - {entity}
-            if not cells[left]:
-                del cells[left]
-        if entered is not None:
-            cells[entered] = cells.get(entered, frozenset()) | {entity}
+        around_left, around_entered = {*_nine(left)}, {*_nine(entered)}
+        for cell in around_left - around_entered:
+            cells[cell] -= {entity}
+            if not cells[cell]:
+                del cells[cell]
+        for cell in around_entered - around_left:
+            cells[cell] = cells.get(cell, frozenset()) | {entity}
 
-    def around(self, cells: Mapping[Cell, frozenset[str]], seen: Observation) -> Iterator[Who]:
-        """Yield all entities that are near enough, and some that are too far away."""
-        cell = self._cell(seen)
-        if cell is None:
-            return
+    def around(self, cells: Mapping[Cell, frozenset[str]], seen: Observation) -> list[Who]:
+        """Return all entities that are near enough, and some that are too far away, in order."""
+        if (cell := self._cell(seen)) is None:
+            return []
         source = self._second if seen.source == self._first else self._first
-        name, _, at_x, at_y = cell
+        if source != seen.source:
+            cell = (cell[0], source, cell[2], cell[3])
+        near = cells.get(cell)
+        if not near or (len(near) == 1 and source == seen.source):  # alone
+            return []
+        return [(source, name) for name in sorted(near) if (source, name) != seen.who]
+
+
+def _nine(cell: Cell | None) -> Iterator[Cell]:
+    if cell is not None:
+        name, source, at_x, at_y = cell
         for x in (at_x - 1, at_x, at_x + 1):
             for y in (at_y - 1, at_y, at_y + 1):
-                for entity in cells.get((name, source, x, y), ()):
-                    if (source, entity) != seen.who:
-                        yield source, entity
+                yield name, source, x, y
 
 
 # ---- an index of areas by position ----
@@ -455,22 +372,25 @@ class EventEngine:
     # ---- observations ----
 
     def _observe(self, observation: Observation) -> None:  # noqa: PLR0912
-        if observation.at != self._state.now:
-            observation = observation._replace(at=self._state.now)
-        who, source, entity = observation.who, observation.source, observation.entity
-        before = self._state.seen.get(who)
-        self._state.seen[who] = observation
-        self._state.awaited.pop(who, None)
-        self._state.due = min(self._state.due, observation.at + self.timeouts[source])
+        state = self._state
+        if observation.at != state.now:
+            observation = observation._replace(at=state.now)
+        source, entity, at, position, values = observation
+        who = (source, entity)
+        before = state.seen.get(who)
+        state.seen[who] = observation
+        if state.awaited:
+            state.awaited.pop(who, None)
+        state.due = min(state.due, at + self.timeouts[source])
         for rule, limits in self.thresholds[source]:
-            value = observation.values.get(limits.field)
+            value = values.get(limits.field)
             if value is not None and rule.takes(who):
                 is_past, is_back = limits.is_past(value), limits.is_back(value)
                 self._latch((rule.name, (entity,)), rule, is_past, is_back)
-        if observation.position is None:
+        if position is None:
             return
-        x, y = observation.position
-        compared, counted = set[str](), set[str]()
+        x, y = position
+        compared, counted = set[str](), frozenset[str]()
         for rule, area in self.areas[source].at(x, y):
             if not rule.takes(who):
                 continue
@@ -479,34 +399,34 @@ class EventEngine:
                 compared.add(rule.name)
                 self._latch((rule.name, (entity,)), rule, away <= area.start, away > area.stop)
             elif away <= area.radius:
-                counted.add(rule.name)
+                counted |= {rule.name}
         # The index does not yield the areas that the entity has left, so their events end here.
-        for key in sorted(self._state.engaged.get(who, ())):
-            left = self.rules[key[0]]
-            if isinstance(left.condition, Near) and key[0] not in compared:
-                self._latch(key, left, False, True)
-        counted_before = self._state.counted.get(who, frozenset())
-        if counted != counted_before:
-            self._state.counted[who] = frozenset(counted)
+        if engaged := state.engaged.get(who):
+            for key in sorted(engaged):
+                left = self.rules[key[0]]
+                if isinstance(left.condition, Near) and key[0] not in compared:
+                    self._latch(key, left, False, True)
+        if counted != (counted_before := state.counted.get(who, _NOBODY)):
+            state.counted[who] = counted
             for name in sorted(counted ^ counted_before):
                 self._count(name, 1 if name in counted else -1)
         for pairs in self.pairs[source]:
             if pairs.rule.takes(who):
-                pairs.move(self._state.cells, entity, before, observation)
+                pairs.move(state.cells, entity, before, observation)
                 self._compare_with_others(pairs, observation)
 
     def _compare_with_others(self, pairs: Pairs, observation: Observation) -> None:
         who, compared = observation.who, set[Key]()
-        rule, limits = pairs.rule, pairs.condition
-        for other in sorted(pairs.around(self._state.cells, observation)):
-            key, away = pairs.key(who, other), distance(observation, self._state.seen[other])
+        rule, limits, state = pairs.rule, pairs.condition, self._state
+        for other in pairs.around(state.cells, observation):
+            key, away = pairs.key(who, other), distance(observation, state.seen[other])
             compared.add(key)
             self._latch(key, rule, away <= limits.start, away > limits.stop)
         # The squares around do not have the partners that are far away, so their events end here. A
         # partner that is still awaited after a restart has no position yet.
-        for key in sorted(self._state.engaged.get(who, ())):
+        for key in sorted(state.engaged.get(who, ())):
             is_left = key[0] == rule.name and key not in compared
-            if is_left and all(entity in self._state.seen for entity in rule.entities_of(key[1])):
+            if is_left and all(entity in state.seen for entity in rule.entities_of(key[1])):
                 self._latch(key, rule, False, True)
 
     def _count(self, name: str, change: int) -> None:

@@ -11,6 +11,7 @@ from pydantic import Field, StringConstraints, model_validator
 from demandops.model.config.base_model import CamelModel
 from demandops.model.config.inventory import Coordinate
 
+FrameId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_./-]*$")]
 # A reference system by its authority and number, such as `EPSG:25832`
 Crs = Annotated[str, StringConstraints(pattern=r"^[A-Z]+:[0-9]+$")]
 
@@ -19,8 +20,11 @@ class MapFrame(CamelModel):
     """A frame in metres, to the east and the north of a point on earth.
 
     The point is ``latitude`` and ``longitude``, or ``x`` and ``y`` of the projected reference
-    system ``crs``. ``datum`` is the reference system of all degrees, by default WGS 84.
+    system ``crs``. ``datum`` is the reference system of all degrees, by default WGS 84. ``frame``
+    is its name in the tree of frames that ``/tf`` tells of.
     """
+
+    frame: FrameId | None = None
 
     latitude: Annotated[float, Field(ge=-90, le=90)] | None = None
     longitude: Annotated[float, Field(ge=-180, le=180)] | None = None
@@ -32,12 +36,19 @@ class MapFrame(CamelModel):
     @model_validator(mode="after")
     def _has_one_origin(self) -> MapFrame:
         degrees = (self.latitude is not None, self.longitude is not None)
-        if any(degrees) is not all(degrees) or any(degrees) is (self.crs is not None):
+        if any(degrees) is not all(degrees) or (any(degrees) and self.crs):
             raise ValueError("needs either latitude and longitude, or crs with x and y")
+        if not (any(degrees) or self.crs or self.frame):
+            raise ValueError("needs either latitude and longitude, or crs with x and y, or frame")
         if not self.crs and (self.x or self.y):
             raise ValueError("has x or y, which belong to crs; leave them out")
-        _ = self._transformer  # so that an unknown reference system is a fault of the file
+        if self.on_earth:
+            _ = self._transformer  # so that an unknown reference system is a fault of the file
         return self
+
+    @property
+    def on_earth(self) -> bool:
+        return self.crs is not None or self.latitude is not None
 
     @cached_property
     def _transformer(self) -> Any:  # noqa: ANN401 - of a library without types

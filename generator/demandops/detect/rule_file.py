@@ -218,27 +218,37 @@ class PositionFields(NamedTuple):
     """The two fields of a message with a position: x and y in metres, or degrees.
 
     Degrees, latitude first, are multiplied by ``scale``. If a field has the value that
-    ``unavailable`` gives it, the message says that the position is not known.
+    ``unavailable`` gives it, the message says that the position is not known. Metres may be in the
+    frame that the field ``frame`` names, with the height ``z``.
     """
 
     first: str
     second: str
     scale: float = 0.0
     unavailable: Mapping[str, float] = MappingProxyType({})
+    z: str = ""
+    frame: str = ""
 
     @property
     def in_degrees(self) -> bool:
         return bool(self.scale)
 
 
+def _in_metres(point: str) -> PositionFields:
+    return PositionFields(f"{point}.x", f"{point}.y", z=f"{point}.z", frame="header.frame_id")
+
+
 _ETSI = "cam.cam_parameters.basic_container.reference_position"
 
 # For some message types, the fields that have the position; a source can name other fields.
 POSITIONS: Mapping[str, PositionFields] = {
-    "geometry_msgs/msg/PoseStamped": PositionFields("pose.position.x", "pose.position.y"),
-    "nav_msgs/msg/Odometry": PositionFields("pose.pose.position.x", "pose.pose.position.y"),
+    "geometry_msgs/msg/PoseStamped": _in_metres("pose.position"),
+    "nav_msgs/msg/Odometry": _in_metres("pose.pose.position"),
     "perception_msgs/msg/EgoData": PositionFields(
-        "state.continuous_state[0]", "state.continuous_state[1]"
+        "state.continuous_state[0]",
+        "state.continuous_state[1]",
+        z="state.continuous_state[2]",
+        frame="header.frame_id",
     ),
     "sensor_msgs/msg/NavSatFix": PositionFields(
         "latitude", "longitude", 1.0, {"status.status": -1}
@@ -259,8 +269,10 @@ class Source(CamelModel):
     If ``topic`` contains ``{entity}``, a topic has the entity's name at that place. If not,
     ``entity`` is the message's field with the entity's name. The entity's position is in the
     fields ``x`` and ``y``, in metres, or ``latitude`` and ``longitude``, in degrees after they are
-    multiplied by ``scale``. A message in which a field has its number in ``unavailable`` counts as
-    silence. An entity counts as gone when it has been silent for ``timeout``.
+    multiplied by ``scale``. Metres may be in another frame than the map's; the field ``frame`` has
+    its name, and ``z`` the height in it. A message in which a field has its number in
+    ``unavailable`` counts as silence. An entity counts as gone when it has been silent for
+    ``timeout``.
     """
 
     topic: Annotated[Text, base_model.without(conditions.topic_pattern_problem)]
@@ -270,6 +282,8 @@ class Source(CamelModel):
     y: FieldPath | None = None
     latitude: FieldPath | None = None
     longitude: FieldPath | None = None
+    z: FieldPath | None = None
+    frame: FieldPath | None = None
     scale: Annotated[float, Field(gt=0, le=1)] | None = None
     unavailable: dict[FieldPath, Number] = Field(default_factory=dict)
     timeout: Duration = "5s"
@@ -288,6 +302,8 @@ class Source(CamelModel):
             raise ValueError("names latitude or longitude alone; give both, or neither")
         if self.x and self.latitude:
             raise ValueError("names both x and latitude; give metres or degrees")
+        if (self.z or self.frame) and self.latitude:
+            raise ValueError("z and frame belong to x and y; leave them out")
         if self.scale is not None and not self.latitude:
             raise ValueError("scale belongs to latitude and longitude; leave it out, or add them")
         if base_model.seconds_of(self.timeout) < 1:
@@ -296,13 +312,18 @@ class Source(CamelModel):
 
     @property
     def position(self) -> PositionFields | None:
-        if self.x and self.y:
-            return PositionFields(self.x, self.y, unavailable=self.unavailable)
         if self.latitude and self.longitude:
             scale = self.scale or 1.0
             return PositionFields(self.latitude, self.longitude, scale, self.unavailable)
         usual = POSITIONS.get(self.type)
-        return usual and usual._replace(unavailable={**usual.unavailable, **self.unavailable})
+        if self.x and self.y:
+            usual = PositionFields(self.x, self.y)
+        if usual is None:
+            return None
+        # a frame that names the entity is not where the entity is
+        frame = self.frame or (usual.frame if usual.frame != self.entity else "")
+        unavailable = {**usual.unavailable, **self.unavailable}
+        return usual._replace(unavailable=unavailable, z=self.z or usual.z, frame=frame)
 
 
 # The identity of an entity: its source and its name.
@@ -404,7 +425,7 @@ class RuleFile(FileModel):
     """Sources by name, and the rules that read them."""
 
     kind: Literal["DetectorRules"]
-    # Where the metres of rules are on earth, for sources that report degrees
+    # Where the metres of rules are on earth and in the tree of frames
     map: MapFrame | None = None
     sources: dict[DnsLabel, Source] = Field(default_factory=dict)
     rules: Items[Rule]
@@ -422,12 +443,16 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
     names: set[str] = set()
     ids: list[tuple[str, Rule]] = []
     for name, listed in rules.sources.items():
-        if rules.map is None and listed.position and listed.position.in_degrees:
+        place, frame = listed.position, rules.map
+        if place and place.in_degrees and not (frame and frame.on_earth):
             message = (
                 "reports degrees; add to the file where its metres are on earth, such as "
                 "'map: {latitude: 50.7784, longitude: 6.0606}'"
             )
             yield fault(f"sources.{name}", message)
+        if listed.frame and not (frame and frame.frame):
+            message = "is set; add to the file in which frame its metres are: 'map: {frame: map}'"
+            yield fault(f"sources.{name}.frame", message)
     for index, rule in enumerate(rules.rules):
         where = f"rules[{index}]"
         if rule.name in names:

@@ -13,7 +13,7 @@ import pygit2
 from pygit2 import Commit, Oid, Tree
 
 from demandops.base import naming, settings
-from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.errors import BeforeTheFirst, InvalidInput, StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import with_lines
 from demandops.decide.state import FileReader, rendered_files
@@ -149,6 +149,7 @@ class Reader:
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
         # newest first; the commits up to REV, after A up to B in ``A..B``, or all
         since, until = self._sides(spec or "")
+        since = since or None
         if path is not None:
             changes = commit_log.changes_to(self.objects, until, path, since)
             return (self._answered(entry) for entry, _, _ in changes)
@@ -166,16 +167,21 @@ class Reader:
         since, until = self._sides(spec or "")
         if since is None:
             return [until]
-        walked = commit_log.commits(self.objects, until, since)
+        walked = commit_log.commits(self.objects, until, since or None)
         return [entry.commit for _, entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
+        # the commits after a time before the first commit are all, which an empty text says
         first, dots, last = spec.partition("..")
         if not dots:
             return None, self.commit(first)
         if not first:
             raise StateRepoError(f"'{spec}' has no start; write A..B")
-        return self.commit(first), self.commit(last)
+        until = self.commit(last)
+        try:
+            return self.commit(first), until
+        except BeforeTheFirst:
+            return "", until
 
     def verify(
         self,
@@ -236,9 +242,10 @@ class Reader:
     def edits(self, entry: LogEntry, kind: str, name: str) -> bool:
         """Return whether a commit changes an override that selects a thing, or a node's entry.
 
-        It is by a person, or by a generator that ends an override.
+        It is by a person, or by a generator that ends an override or takes over nodes.
         """
-        if entry.by_generator and entry.first("Operation") != "expire-override":
+        operation = entry.first("Operation")
+        if entry.by_generator and operation not in ("expire-override", "discover"):
             return False
         commit = trees.commit_of(self.objects, entry.commit)
         sides = trees.parent_tree(commit), commit.tree

@@ -17,6 +17,7 @@ from demandops.base.settings import (
 )
 from demandops.decide.planning.planner import ReleaseKey, affected_keys, all_keys, plan
 from demandops.decide.state import rendered_files
+from demandops.model.config import discovered
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
@@ -47,7 +48,9 @@ _REWRITING = ("follow", "upgrade")
 _ENDING = ("follow", "upgrade", "expire-override")
 
 
-def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> Iterator[str]:
+def disallowed_files(  # noqa: PLR0912 - a branch for each kind of file
+    repo: Repository, commit: Commit, entry: LogEntry
+) -> Iterator[str]:
     # These are files that people write, claims of demands that the message does not name, claims in
     # another format than the generator's, and records that the commit's operation must not change.
     if not commit.parents:  # `demandops init` writes everything
@@ -74,7 +77,11 @@ def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> Itera
         only_removes = old is not None and without_ignored_fields(path, old) == new
         if operation == "upgrade" and (path == ROOT_FILE or only_removes):
             continue
-        if root != claim_files.LEDGER_ROOT:
+        is_put_back = earlier is not None and trees.entry_id(earlier, path) == blob
+        if discovered.is_discovered(path):
+            if not (is_put_back or (operation == "discover" and _is_as_written(new, path))):
+                yield path
+        elif root != claim_files.LEDGER_ROOT:
             yield path
         elif path.startswith(f"{records.MARKERS_ROOT}/"):
             is_valid = not new or records.read_ended_override({path: new})
@@ -83,10 +90,15 @@ def disallowed_files(repo: Repository, commit: Commit, entry: LogEntry) -> Itera
         elif path.rsplit("/", 1)[-1] in named:
             if blob and not _is_canonical(commit, path):
                 yield path
-        elif (operation not in _REWRITING or not _only_rewrites(commit, path)) and not (
-            earlier is not None and trees.entry_id(earlier, path) == blob
-        ):
+        elif (operation not in _REWRITING or not _only_rewrites(commit, path)) and not is_put_back:
             yield path
+
+
+def _is_as_written(text: str | None, path: str) -> bool:
+    try:
+        return text is None or discovered.text_of(discovered.read(text, path)) == text
+    except InvalidInput:
+        return False
 
 
 def _only_rewrites(commit: Commit, path: str) -> bool:

@@ -28,6 +28,7 @@ from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.ledger.records import in_turn
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.journal import Receipt, Ticket
+from demandops.serve.node_discovery import NodeDiscovery
 
 log = logging.getLogger("demandops")
 
@@ -77,7 +78,8 @@ class Agenda:
     | what | when |
     | --- | --- |
     | leases | when the first one ends: a demand is released |
-    | own work | ends of overrides, drains, demands that wait for room: each batch begins with it |
+    | own work | ends of overrides, drains, changed nodes of clusters, demands that wait for room: \
+    each batch begins with it |
     | fetch | at an interval, and soon after a request |
     | check | of the proposals: soon after main has moved, else at an interval |
     | judge | the configuration of main again, if it is not in effect and claims have ended |
@@ -111,6 +113,7 @@ class Agenda:
         self._tried: World | None = None
         self.left: list[str] = []  # waiting demands that the last round left for later
         self.must_judge, self._judge_at = False, now
+        self.nodes = NodeDiscovery(runtime)
 
     def due_in(self, state: State, main: str, *, has_news: bool = False) -> dict[What, float]:
         # in seconds; ``main`` is empty if no proposal awaits approval, and ``has_news`` says
@@ -128,6 +131,7 @@ class Agenda:
             seconds = (end - self._runtime.now()).total_seconds() + 0.01
             own_work = min(own_work, max(seconds, self.waits_s("end", name)))
         own_work = min([own_work, *(self.waits_s("drain", node) for node in _to_drain(state))])
+        own_work = min(own_work, self.nodes.due_in(state))
         first = state.ledger.first_to_end()
         if first is not self._first_to_end:  # a search is slow if many leases end at one time
             self._first_to_end, self._next_end = first, state.ledger.next_lease_end()
@@ -183,6 +187,8 @@ class Agenda:
                 self.failed("end", name)
                 for problem in error.faults:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
+        # what clusters say may drain a node
+        self.nodes.commit_due(commits)
         # what runs moves before what waits is booked
         for node in _to_drain(commits.head.state):
             if not self.waits_s("drain", node):

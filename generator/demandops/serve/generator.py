@@ -105,6 +105,8 @@ class Generator:
             refusal_patience_s,
         )
         self.fetch_now, self.withdraw = self._worker.fetch_now, self._demands.withdraw
+        self.take_over_nodes = self._worker.take_over_nodes
+        self.nodes_changed = self._worker.nodes_changed
         self.includes, self.unchanged = repository.includes, repository.unchanged
         self._finished: Future[bool] | None = None
         self._stop_lock = runtime.lock()

@@ -25,7 +25,7 @@ from demandops.decide.bookkeeping import (
 from demandops.decide.planning.overrides import suspended_by
 from demandops.decide.planning.planner import running_version
 from demandops.model.config.base_model import duration_text, parse_file, parse_time, relative
-from demandops.model.config.config import DOMAINS_FILE
+from demandops.model.config.config import DOMAINS_FILE, NODES_FILE
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand
@@ -565,6 +565,7 @@ def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
         "type": node.type if node else None,
         "cluster": node.cluster if node else None,
         "domain": domain.name if domain else None,
+        "file": source.config.entry_files[NODES_FILE].get(source.config.host_of(id)),
         "drained": bool(node and node.drained),
         "capabilities": list(node.capabilities) if node else [],
         "properties": dict(node.properties) if node else {},
@@ -806,7 +807,7 @@ KINDS: dict[str, Kind] = {
                     "releases", "Releases", 5, texts_of=lambda item, now: str(len(item["releases"]))
                 ),
                 *(REQUESTERS, _wide("capabilities", "Capabilities")),
-                _wide("properties", "Properties", texts_of=_properties),
+                *(_wide("properties", "Properties", texts_of=_properties), _wide("file", "File")),
             ),
             _nodes,
             _node,

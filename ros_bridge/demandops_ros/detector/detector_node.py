@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
 from math import inf
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +20,21 @@ from demandops.base.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_N
 from demandops.base.strict_yaml import read_input
 from demandops.detect.condition import entity_in
 from demandops.detect.detector import Detector, Outcome, Sending, Want, WantedDemands, booked_events
-from demandops.detect.event_engine import Key, MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Key, Observation
+from demandops.detect.message_reader import (
+    TF_TOPICS,
+    TF_TYPE,
+    FrameTree,
+    MessageReader,
+    NoTransform,
+    Unreadable,
+)
 from demandops.detect.rule_file import Goal, RuleFile, read
 from demandops_interfaces.msg import Bookkeeping
+from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
 from demandops_ros import ros_process
 from demandops_ros.actions import DemandError, GoalSender
@@ -83,11 +91,20 @@ PARAMETERS = {
 
 # ---- subscriptions to the topics that match the sources of rules ----
 #
-# Topics may appear and vanish at any time.
+# Topics may appear and vanish at any time. Their messages are taken when the detector steps, many
+# at a time: rclpy's executor would wake for each, which costs more than to read it. They are read
+# in the order in which they came, so that a bag that was recorded meanwhile gives the same events.
 
 # A subscription is reliable if all publishers that it finds are. The queue is deep, because many
 # entities may share a topic.
-_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
+_QOS = QoSProfile(depth=10_000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
+# Whoever tells of static frames told it once, and keeps it for who comes later.
+_STATIC_QOS = QoSProfile(depth=1000, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class _NoCallbacks(CallbackGroup):  # type: ignore[misc]
+    def can_execute(self, _: object) -> bool:
+        return False
 
 
 def message_class(type_name: str) -> Any:  # noqa: ANN401 - a generated class
@@ -104,13 +121,24 @@ class SourceSubscriptions:
         node: Node,
         file: RuleFile,
         now: Callable[[], float],
-        observe: Callable[[Observation], None],
     ) -> None:
-        self._node, self._file, self._now, self._observe = node, file, now, observe
-        self._readers = {name: MessageReader(file, name) for name in file.sources}
-        self.subscriptions: dict[tuple[str, str], Any] = {}  # by source and topic
+        self._node, self._file, self._now = node, file, now
+        self._group = _NoCallbacks()
+        self._frames = FrameTree(file.map.frame) if file.map and file.map.frame else None
+        self._readers = {name: MessageReader(file, name, self._frames) for name in file.sources}
+        # by source and topic, with the entity that the topic names
+        self.subscriptions: dict[tuple[str, str], tuple[Any, str]] = {}
+        self._of_frames = {
+            topic: self._subscribe(TF_TYPE, topic, _STATIC_QOS if is_static else _QOS)
+            for topic, is_static in (TF_TOPICS if self._frames else {}).items()
+        }
         self._told: set[str] = set()
         self.messages = self.unreadable = 0
+
+    def _subscribe(self, type_name: str, topic: str, qos: QoSProfile = _QOS) -> Any:  # noqa: ANN401
+        return self._node.create_subscription(
+            message_class(type_name), topic, lambda _: None, qos, callback_group=self._group
+        )
 
     def refresh(self) -> None:
         published: Mapping[str, list[str]] = dict(self._node.get_topic_names_and_types())
@@ -125,33 +153,55 @@ class SourceSubscriptions:
                         f"{name} reads {source.type}"
                     )
                 elif self._node.count_publishers(topic):
-                    self.subscriptions[name, topic] = self._node.create_subscription(
-                        message_class(source.type),
-                        topic,
-                        partial(self._read, name, topic, entity),
-                        _QOS,
-                    )
+                    self.subscriptions[name, topic] = self._subscribe(source.type, topic), entity
         for key in [*self.subscriptions]:
             if not self._node.count_publishers(key[1]):
-                self._node.destroy_subscription(self.subscriptions.pop(key))
+                self._node.destroy_subscription(self.subscriptions.pop(key)[0])
 
     def close(self) -> None:
-        while self.subscriptions:
-            self._node.destroy_subscription(self.subscriptions.popitem()[1])
+        for each in (*self._of_frames.values(), *(each for each, _ in self.subscriptions.values())):
+            self._node.destroy_subscription(each)
+        self.subscriptions, self._of_frames = {}, {}
 
-    def _read(self, source: str, topic: str, entity: str, message: Any) -> None:  # noqa: ANN401
-        self.messages += 1
-        try:
-            if heard := self._readers[source].observation(message, entity, self._now()):
-                self._observe(heard)
-        except Unreadable as error:
-            self.unreadable += 1
-            self._tell_once(f"a message on {topic} is left out: {error}")
+    def take(self) -> list[Observation]:
+        """Return what the messages report that have come since the last call."""
+        now, is_simulated = self._now(), self._node.get_clock().ros_time_is_active
+        came: list[tuple[int, str, str, str, Any]] = []
+        for topic, subscription in self._of_frames.items():
+            came += ((at, "", topic, "", each) for at, each in _taken(subscription))
+        for (source, topic), (subscription, entity) in self.subscriptions.items():
+            came += ((at, source, topic, entity, each) for at, each in _taken(subscription))
+        observations = []
+        for received, source, topic, entity, message in sorted(came, key=itemgetter(0)):
+            at = now if is_simulated or not received else received / 1e9
+            if self._frames and not source:
+                self._frames.hear(message, TF_TOPICS[topic], at)
+                continue
+            self.messages += 1
+            try:
+                if heard := self._readers[source].observation(message, entity, at):
+                    observations.append(heard)
+            except Unreadable as error:
+                self.unreadable += 1
+                what = (
+                    "" if isinstance(error, NoTransform) else f"a message on {topic} is left out: "
+                )
+                self._tell_once(f"{what}{error}")
+        return observations
 
     def _tell_once(self, text: str) -> None:
         if text not in self._told and len(self._told) < 1000:  # what is told is kept in memory
             self._told.add(text)
             self._node.get_logger().warning(one_line(text))
+
+
+def _taken(subscription: Any) -> Iterator[tuple[int, Any]]:  # noqa: ANN401
+    # at most what the queue holds, so that a fast publisher does not keep the detector here
+    with subscription.handle:
+        for _ in range(_QOS.depth):
+            if (taken := subscription.handle.take_message(subscription.msg_type, False)) is None:
+                return
+            yield taken[1]["received_timestamp"], taken[0]
 
 
 # ---- the demands of events, sent in separate threads and again after a failure ----
@@ -251,6 +301,8 @@ class DemandSender:
 # not end these demands.
 
 _MOST_REFUSALS = 20  # that the diagnostics list
+# How many observations are kept until the detector has started
+_MOST_OBSERVATIONS = 100_000
 # The time that ROS reports until the first message of a simulated clock arrives.
 _UNHEARD_CLOCK = 0.0
 # If the clock jumps by more, someone has set the clock or restarted the simulation.
@@ -285,7 +337,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._last_now, self._last_look = self._now(), REAL.monotonic()
         self._detector = Detector(file, self._last_now)
         self._is_started = False
-        self._observations: deque[Observation] = deque(maxlen=100_000)
+        self._observations: list[Observation] = []
         self._sender = DemandSender(
             settings["action_name"],
             settings["demand_action_name"],
@@ -323,13 +375,9 @@ class DetectorNode(Node):  # type: ignore[misc]
         return float(self.get_clock().now().nanoseconds) / 1e9
 
     def _subscribe(self, file: RuleFile) -> SourceSubscriptions:
-        topics = SourceSubscriptions(self, file, self._now, self._observe)
+        topics = SourceSubscriptions(self, file, self._now)
         topics.refresh()
         return topics
-
-    def _observe(self, observation: Observation) -> None:
-        if observation.at != _UNHEARD_CLOCK:
-            self._observations.append(observation)
 
     # ---- start: find the demands of the earlier run ----
 
@@ -348,7 +396,9 @@ class DetectorNode(Node):  # type: ignore[misc]
     # ---- periodic work ----
 
     def _step(self) -> None:
-        now = self._now()
+        taken, now = self._topics.take(), self._now()
+        if now != _UNHEARD_CLOCK:
+            self._observations = (self._observations + taken)[-_MOST_OBSERVATIONS:]
         if not self._is_started:
             if self._bookkeeping is None or now == _UNHEARD_CLOCK:
                 return
@@ -363,7 +413,7 @@ class DetectorNode(Node):  # type: ignore[misc]
                 len(self._detector.file.rules),
                 len(booked),
             )
-        observations = [self._observations.popleft() for _ in range(len(self._observations))]
+        observations, self._observations = self._observations, []
         # if the clock was set since the last step, the detector's times are moved with it
         look, passed = REAL.monotonic(), now - self._last_now
         # a simulated clock may run at any speed, so only one that goes back was set
@@ -429,12 +479,15 @@ class DetectorNode(Node):  # type: ignore[misc]
 def _read_rules(path: Path) -> tuple[RuleFile, str]:
     place, text = read_input(path)
     file = read(text, place)
-    remedy = "install its package, or start the detector in a workspace that has it"
+    remedy = "build it from the folder of its definitions (docs/detector.md#messages), or start "
+    remedy += "the detector in a workspace that has it"
     faults = [
         fault(f"sources.{name}.type", f"{source.type} is not installed; {remedy}")
         for name, source in file.sources.items()
         if message_class(source.type) is None
     ]
+    if file.map and file.map.frame and message_class(TF_TYPE) is None:
+        faults.append(fault("map.frame", f"needs {TF_TYPE}, which is not installed; {remedy}"))
     if faults:
         raise InvalidInput(problem.within(place) for problem in faults)
     return file, text

@@ -17,7 +17,14 @@ from demandops.cli.formats import Table
 from demandops.cli.output import errors
 from demandops.detect.condition import Count, Near, entity_in
 from demandops.detect.detector import Detector
-from demandops.detect.event_engine import Event, Key, MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Event, Key, Observation
+from demandops.detect.message_reader import (
+    TF_TOPICS,
+    TF_TYPE,
+    FrameTree,
+    MessageReader,
+    Unreadable,
+)
 from demandops.detect.rule_file import Goal, RuleFile
 from demandops.views.rows import Column
 from rosbags.highlevel import AnyReader
@@ -39,7 +46,8 @@ class RecordedBag:
         except Exception as error:  # a damaged bag makes the library raise errors of any kind
             message = f"is not a bag that can be read: {one_line(str(error))}"
             raise InvalidInput.at("", message, file=str(path)) from None
-        self._readers = {name: MessageReader(file, name) for name in file.sources}
+        self._frames = FrameTree(file.map.frame) if file.map and file.map.frame else None
+        self._readers = {name: MessageReader(file, name, self._frames) for name in file.sources}
         self._sources: dict[int, list[tuple[str, str]]] = {}
         self.topics: set[str] = set()
         # Topics that match a source by name, but not by their message type.
@@ -75,7 +83,12 @@ class RecordedBag:
         return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
 
     def observations(self) -> Iterator[Observation]:
-        connections = [item for item in self._reader.connections if item.id in self._sources]
+        connections = [
+            item
+            for item in self._reader.connections
+            if item.id in self._sources
+            or (self._frames and item.topic in TF_TOPICS and item.msgtype == TF_TYPE)
+        ]
         messages = self._reader.messages(connections=connections)
         while True:
             try:
@@ -85,12 +98,16 @@ class RecordedBag:
             except Exception as error:  # the rest of a damaged bag
                 self._leave_out(REST_OF_BAG, f"cannot be read: {error!r}")
                 return
-            for source, entity in self._sources[connection.id]:
-                try:
-                    message = self._reader.deserialize(data, connection.msgtype)
-                except Exception as error:  # rosbags raises errors of many kinds
+            sources = self._sources.get(connection.id, [])
+            try:
+                message = self._reader.deserialize(data, connection.msgtype)
+            except Exception as error:  # rosbags raises errors of many kinds
+                for _ in sources:
                     self._leave_out(connection.topic, f"cannot be decoded: {error!r}")
-                    continue
+                continue
+            if self._frames and connection.topic in TF_TOPICS:
+                self._frames.hear(message, TF_TOPICS[connection.topic], nanoseconds / 1e9)
+            for source, entity in sources:
                 try:
                     reader = self._readers[source]
                     if heard := reader.observation(message, entity, nanoseconds / 1e9):

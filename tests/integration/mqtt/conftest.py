@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import socket
 import subprocess
@@ -15,7 +14,9 @@ from typing import Any
 
 import paho.mqtt.client as mqtt
 import pytest
+import rclpy
 import yaml
+from rclpy.node import Node
 
 from tests.e2e.rig import pki
 from tests.kit.limits import PATIENCE_S
@@ -111,24 +112,14 @@ class Pod:
             for name, text in files.items():
                 (place / name).write_text(text)
         for container in self._spec.get("initContainers", ()):
-            self._run(container, [sys.executable, *container["command"][1:]])
+            command = [self._on_host(container, part) for part in container["command"][1:]]
+            subprocess.run([sys.executable, *command], timeout=PATIENCE_S, check=True)
 
     def _on_host(self, container: dict[str, Any], text: str) -> str:
         """Return ``text`` with the container's mount paths replaced by its volumes' folders."""
         for mount in container["volumeMounts"]:
             text = text.replace(f"{mount['mountPath']}", str(self.folder / mount["name"]))
         return text
-
-    def _run(self, container: dict[str, Any], command: list[str]) -> str:
-        done = subprocess.run(
-            [self._on_host(container, part) for part in command],
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        return done.stdout
 
     @cached_property
     def parameters(self) -> dict[str, Any]:
@@ -137,11 +128,16 @@ class Pod:
         arguments = container["args"]
         assert arguments[:4] == ["ros2", "launch", "mqtt_client", "standalone.launch.ros2.xml"]
         given = dict(argument.split(":=") for argument in arguments[4:])
-        script = str(Path(__file__).with_name("read_parameters.py"))
-        ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params_file"]]
-        read = json.loads(self._run(container, [sys.executable, script, "--ros-args", *ros_args]))
-        assert read["node"] == self.deployment["metadata"]["name"].replace("-", "_")
-        found: dict[str, Any] = read["parameters"]
+        file, context = self._on_host(container, given["params_file"]), rclpy.Context()
+        ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", file]
+        rclpy.init(args=["--ros-args", *ros_args], context=context)
+        node = Node("x", context=context, automatically_declare_parameters_from_overrides=True)
+        assert node.get_name() == self.deployment["metadata"]["name"].replace("-", "_")
+        found: dict[str, Any] = {
+            name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()
+        }
+        node.destroy_node()
+        context.try_shutdown()
         found["broker.tls.ca_certificate"] = self._on_host(
             container, found["broker.tls.ca_certificate"]
         )

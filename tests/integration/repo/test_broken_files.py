@@ -31,7 +31,7 @@ from tests.kit.repo import read as text
 from tests.kit.rig import Person, goal, leave
 
 TABLES = plain_yaml.beside(__file__)
-NODES, IMAGES = "inventory/nodes.yaml", "registry/images.yaml"
+CLUSTERS, NODES, IMAGES = "inventory/clusters.yaml", "inventory/nodes.yaml", "registry/images.yaml"
 DETECTION = "clusters/c-its/perception/edge/od-edge-station00.yaml"
 TWO = override({"services": ["object-detection"], "nodes": ["edge"]}, replicas=2)
 BROKEN = override({"services": ["object-fusion"], "nodes": ["edge"]}, replicas="many")
@@ -72,42 +72,6 @@ def _change(random: Random, bare: Path, nodes: str) -> dict[str, str | None]:
         first | second if random.random() < 0.3 else random.choice([*changes[:1] * 4, *changes])
     )
     return {**chosen, "notes.md": str(random.random())}
-
-
-@pytest.mark.parametrize("style", TABLES["merges"])
-def test_a_merge_of_any_style_is_judged_and_so_is_a_second_one_of_the_same_branch(
-    bare: Path, person: Person, style: str
-) -> None:
-    def merge(text: str, *, number: int) -> None:
-        person.fetch()
-        folder = person.folder
-        # the second time on the same branch, where the forge's way of merging allows that
-        start = "main~1" if number == 1 and style != "fast-forward" else "main"
-        if number == 1 or style in ("squash", "rebase", "fast-forward"):
-            rig.git(folder, "branch", "-f", "topic", start)
-        rig.git(folder, "checkout", "-q", "topic")
-        (folder / "overrides" / "topic.yaml").write_text(text)
-        rig.git(folder, "add", "overrides")
-        rig.git(folder, "commit", "-q", "-m", "The topic")
-        for command in TABLES["merges"][style]:
-            rig.git(folder, *command.replace("BRANCH", "topic").split())
-        rig.git(folder, "push", "-q", "origin", "main")
-
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1), goal(2))
-        merge(BROKEN, number=1)
-        rig.book(generator, goal(3))
-        assert {each.file for each in generator.snapshot.problems} == {"overrides/topic.yaml"}
-    with rig.running(bare) as generator:
-        rig.book(generator, leave(1))
-        assert generator.snapshot.problems
-        merge(BROKEN.replace("many", "5"), number=2)
-        rig.book(generator, goal(4))
-        assert generator.snapshot.problems == ()
-    assert differing(bare) == {}
-
-
-CLUSTERS = "inventory/clusters.yaml"
 
 
 @pytest.mark.parametrize("mistakes", TABLES["mistakes"].values(), ids=TABLES["mistakes"])

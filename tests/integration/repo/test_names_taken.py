@@ -16,7 +16,7 @@ from demandops.repo.merge_check import merge_check
 from demandops.repo.write.proposal_branch import branch_name
 
 from tests.kit import rig
-from tests.kit.goals import Goal, application, goal, put
+from tests.kit.goals import Goal, application, goal
 from tests.kit.repo import Person, branches, read
 from tests.kit.rig import Proposed
 
@@ -80,12 +80,3 @@ def test_a_proposal_leaves_the_branch_of_another_alone(bare: Path, petra: Person
         petra.merge(branch, "--ff-only")
         assert first.outcome() == "booked"
     assert claims(bare) == {"edge/a"}
-
-
-def test_a_branch_that_somebody_else_made_is_left_alone(bare: Path, petra: Person) -> None:
-    branch = branch_name("d", "op-1")
-    made = rig.tip(bare)
-    rig.git(bare, "branch", branch, made)
-    with rig.running(bare) as generator:
-        assert rig.outcome(generator.submit(put("d"), "op-1")) == "conflict"
-    assert rig.git(bare, "rev-parse", branch) == made

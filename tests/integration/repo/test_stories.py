@@ -136,10 +136,6 @@ class Story:
         assert at == "for demands"
         del self._options["fetch_interval"]
 
-    def options(self, options: Mapping[str, Any]) -> None:
-        """Set options of the generators that are started later."""
-        self._options.update(options)
-
     def cut_off(self, name: str) -> None:
         """Stop a generator at once, so that what it has not published stays in the journal."""
         self._generators[name].close(0)
@@ -330,6 +326,10 @@ class Story:
             self.edit_claim({word: "kind: 5\n"}, **how)
         else:
             self.change(commit["files"], **how)
+
+    def commit(self, commit: Mapping[str, Any]) -> None:
+        """Commit files, as `change`, with this message."""
+        self.change(commit["files"], message=commit["message"])
 
     def undo(self, last: str) -> None:
         """Undo the last change."""
@@ -576,6 +576,10 @@ class Story:
             found = repo.verify(commits)
             assert found == repo.verify(commits, whole=True)
         assert [verdict.holds for verdict in found] == holds, found
+
+    def whole(self, what: str) -> None:
+        """Check that each commit verifies, without a claim about who made it."""
+        assert what == "history" and rig.differing(self._bare) == {}
 
     def fails(self, what: str) -> None:
         assert any(name.startswith(what) for name in self._generator.failures)

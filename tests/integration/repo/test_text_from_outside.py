@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 from demandops.repo import reader
-from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.repo import FORGER, git, read
@@ -46,24 +45,6 @@ def test_a_parameter_forges_no_message(bare: Path, person: Person, text: str) ->
     assert all(holds for holds, _ in verdicts(bare))
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
-
-
-@pytest.mark.parametrize(
-    ("message", "text"),
-    [(f"Forged\n\n{FORGED}\n", "Why: x"), ("Render-Version: 1\n\nFrom: x\n", "")],
-)
-def test_a_persons_commit_that_quotes_trailers_is_a_persons(
-    generator: Generator, bare: Path, person: Person, message: str, text: str
-) -> None:
-    rig.book(generator, goal(1))
-    before = read(bare, DETECTION)
-    person.change({DETECTION: before + "# changed\n"}, message)
-    rig.book(generator, goal(2))
-    assert read(bare, DETECTION) == before
-    assert (True, "made by a person") in verdicts(bare)
-    with reader.opened(str(bare)) as repo:
-        (entry,) = [entry for entry in repo.log() if entry.author == "Petra Platform"][-1:]
-    assert (entry.trailers, entry.why) == ({}, text)  # what the person wrote, as it is
 
 
 def test_where_keys_are_listed_an_unsigned_commit_is_a_persons(

@@ -144,6 +144,9 @@ def test_a_release_is_explained(look: Look, state: GitRepo) -> None:
     assert shown == rendered
     assert difference.splitlines()[1:] == [f"+{line}" for line in rendered.splitlines()]
     assert "started" in page.texts("td")
+    assert "With it, the release starts." in page.text
+    changed = look("/release", name="of-edge-object-detection-fusion-cf7e0180a8bb")
+    assert "With it, the release reconfigures." in changed.text
 
 
 def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:

@@ -1,24 +1,28 @@
-"""When clients restart, and what is never rendered for them.
+"""When clients restart, what is never rendered for them, and what their programs declare.
 
 ``tests/scenarios/clients-carry-what-is-demanded.yaml`` and ``tests/golden`` have what they carry.
+The repo in memory takes no configuration with a field that its schema lacks, so the schemas are
+compared with ``declared.yaml``.
 """
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from demandops.base.errors import Refused
-from demandops.base.naming import Subject, SubjectKind
-from demandops.connections.connection import ClientKey, Route
-from demandops.connections.zenoh import ZENOH
-from demandops.decide.planning.planner import affected_keys
+from demandops.base.settings import data_folder
+from demandops.connections import connection_types
+from demandops.connections.connection import ROUTE_OPTIONS, Route
+from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.decide.state import State, rendered_files
-from demandops.model.ledger.ledger import changes_on
 
 from tests.kit import plain_yaml
 from tests.kit.config import skeleton
@@ -72,18 +76,6 @@ def test_a_further_topic_restarts_who_cannot_read_it_and_a_further_requester_nob
     assert sum(one != before[1][name] for name, one in configurations(repo).items()) == 2
 
 
-def test_both_nodes_of_a_connection_are_affected_and_no_other() -> None:
-    repo = MemoryRepo(state=state(vehicle00=SPEAKS, vehicle01=SPEAKS, edge=REACHABLE))
-    before = repo.state
-    for number, id in enumerate("dc"):
-        repo.send(
-            routes(demand("zenoh", {f"/{id}": f"/{id}"}, id=id, source=f"vehicle0{1 - number}"))
-        )
-    changes = changes_on(before.ledger, repo.state.ledger, [Subject(SubjectKind.CONNECTION, "c")])
-    keys = affected_keys(before, repo.state, changes)
-    assert keys == (ClientKey(ZENOH, "vehicle00"), ClientKey(ZENOH, "edge"))
-
-
 def test_no_two_connections_share_an_mqtt_topic_or_a_client_id() -> None:
     repo = MemoryRepo()
     ids = ("c", "c/d", "c_d", "C", "c-source", "c/source", "+", "#", "$SYS/x", "a/+/b", "/", "//")
@@ -131,3 +123,85 @@ def test_what_people_change_in_git_so_that_the_type_cannot_carry_it_is_told(
         rendered_files(replace(state(**(NODES | case.get("lost", {}))), ledger=ledger))
     found = refused.value.faults[0]
     assert (found.field, found.message[: len(case["told"])]) == (case["field"], case["told"])
+
+
+# ---- what the clients' programs declare ----
+
+DECLARED = plain_yaml.beside(__file__, "declared")
+TYPES = {"string": "str", "integer": "int", "boolean": "bool", "number": "float"}
+
+
+def leaves(schema: Any, definitions: Any, path: str = "") -> Iterator[tuple[str, str]]:
+    """Yield (path, name of the Python type) for each value that a schema allows."""
+    if "$ref" in schema:
+        schema = definitions[schema["$ref"].rpartition("/")[2]]
+    if schema.get("type") == "array":
+        items = schema["items"]
+        for item in items if isinstance(items, list) else [items]:
+            yield from leaves(item, definitions, f"{path}[]")
+    elif schema.get("type") == "object":
+        assert schema["additionalProperties"] is False, path
+        patterns = [("{}", part) for part in schema.get("patternProperties", {}).values()]
+        for name, part in (*schema.get("properties", {}).items(), *patterns):
+            yield from leaves(part, definitions, f"{path}.{name}" if path else name)
+    else:
+        values = schema.get("enum", [schema.get("const")])
+        yield path, TYPES[schema["type"]] if "type" in schema else type(values[0]).__name__
+
+
+@pytest.mark.parametrize("program", DECLARED, ids=lambda one: f"{one['program']} {one['version']}")
+def test_a_program_declares_all_that_its_clients_are_told(program: dict[str, Any]) -> None:
+    file = data_folder("templates") / "connections" / program["type"] / "schema.json"
+    schema = json.loads(file.read_text())
+    prefix = "/**/*.ros__parameters."  # for all nodes of a ROS program
+    told = {
+        (path.removeprefix(prefix), name) for path, name in leaves(schema, schema["definitions"])
+    }
+    assert len(told) > 5
+    assert told - {*program["reads"].items()} == set()
+
+
+def test_there_is_a_program_for_each_connection_type() -> None:
+    words = {known.word for known in connection_types.CONNECTION_TYPES}
+    assert {program["type"] for program in DECLARED} == words
+
+
+# ---- the example of docs/connections.md ----
+
+
+ROOT = Path(__file__).parents[3]
+EXAMPLE = ROOT / "examples" / "connections"
+PAGE = (ROOT / "docs" / "connections.md").read_text()
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_the_example_gives_what_the_page_says() -> None:
+    found = {str(path.relative_to(EXAMPLE)): path.read_text() for path in EXAMPLE.rglob("*.yaml")}
+    request = yaml.safe_load(found.pop("demand.yaml"))
+    books = MemoryRepo(found)
+    decision = books.send(request)
+
+    clients = books.objects("ConfigMap")
+    bridge = json.loads((EXAMPLE / "zenoh-vehicle00.json").read_text())
+    assert json.loads(clients["zenoh-vehicle00"]["data"]["config.json5"]) == bridge
+    (warning,) = blocks("text")
+    assert decision.warnings == (warning.strip(),)
+    (station,) = (item for name, item in clients.items() if "-source-" in name)
+    parameters = yaml.safe_load(station["data"]["params.yaml"])["/**/*"]["ros__parameters"]
+    assert parameters["bridge"]["ros2mqtt"]["ros_topics"] == ["/warnings"]
+    assert parameters["broker"]["tls"]["enabled"] is True
+
+
+def test_every_field_of_a_route_is_explained_with_the_types_that_honour_it() -> None:
+    rows = re.findall(r"^\| `(\w+)`[^|]*\|[^|]*\| ([^|]*) \|$", PAGE, re.MULTILINE)
+    told = {name: row for name, row in rows if name in ROUTE_OPTIONS}
+    assert told.keys() == {*ROUTE_OPTIONS}
+    honoured = frozenset().union(*(kind.options for kind in CONNECTION_TYPES))
+    assert honoured == {*ROUTE_OPTIONS} - {"type", "reverse"}, "each does something in some client"
+    for kind in CONNECTION_TYPES:
+        label = {"MQTT": "MQTT", "ZENOH": "Zenoh", "ROS": "ROS"}[kind.name]
+        listed = {name for name, row in told.items() if label in row and name != "type"}
+        assert listed == kind.options

@@ -1,10 +1,11 @@
-"""One demand causes a bounded amount of work, however it is made.
+"""A demand causes a bounded amount of work, however it is made, and so does a merged file.
 
 Work is counted in calls of functions and in looks at the clock, so the tests need no clock.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -13,11 +14,13 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import OverBudget, Refused
+from demandops.base.errors import Fault, InvalidInput, OverBudget, Refused
 from demandops.decide.decision import decide
 from demandops.decide.placement.placement import MOST_ATTEMPTS
+from demandops.model.config.load import load
 
-from tests.kit.config import override, skeleton
+from tests.kit import plain_yaml
+from tests.kit.config import configuration, override, skeleton
 from tests.kit.goals import Goal, application, connection, goal, perception
 from tests.kit.memory import MemoryRepo
 
@@ -240,3 +243,52 @@ def test_the_work_grows_with_the_demand_and_not_faster(made: Callable[[int], Goa
     for held in (False, True):
         once = work(400, held=held)
         assert work(800, held=held) < 2.5 * once
+
+
+# ---- merged files with thousands of entries ----
+
+MANY = plain_yaml.beside(__file__, "many-entries")
+
+
+def files_of(kind: str, count: int) -> dict[str, str]:
+    """Return the files with ``count`` entries of each form of a case."""
+    files = dict[str, str]()
+    for path, document in MANY[kind].items():
+        if "{}" in path:
+            files |= {
+                numbered(path, number): override(*one.pop("select"), **one)
+                for number, one in enumerate(numbered(document, n) for n in range(count))
+            }
+        else:
+            entries = {
+                field: [numbered(one[0], number) for number in range(count)]
+                for field, one in document.items()
+                if isinstance(one, list)
+            }
+            files[path] = yaml.safe_dump({"apiVersion": "demandops/v1"} | document | entries)
+    return files
+
+
+def numbered(entry: Any, number: int) -> Any:
+    text = json.dumps(entry).replace(' "{}"', f" {number}")
+    return json.loads(text.replace("{}", f"{number:04}"))
+
+
+def work_of_loading(files: dict[str, str]) -> tuple[int, tuple[Fault, ...]]:
+    calls, whole = [0], configuration(files)
+    with counted(calls):
+        try:
+            load(whole)
+        except InvalidInput as invalid:
+            return calls[0], invalid.faults
+    return calls[0], ()
+
+
+@pytest.mark.parametrize("kind", MANY)
+def test_the_work_to_load_files_grows_with_their_entries_and_not_faster(kind: str) -> None:
+    work_of_loading({})  # what is read once for all
+    none, _ = work_of_loading({})
+    few, _ = work_of_loading(files_of(kind, 200))
+    many, faults = work_of_loading(files_of(kind, 800))
+    assert many - none < 6 * (few - none), "four times as many entries"
+    assert len(faults) < 4 * 800

@@ -7,9 +7,9 @@ from types import SimpleNamespace as Message
 from typing import Any
 
 import pytest
-from demandops.base.errors import InvalidInput
 from demandops.detect import rule_file
-from demandops.detect.event_engine import MessageReader, Observation, Unreadable
+from demandops.detect.event_engine import Observation
+from demandops.detect.message_reader import MessageReader, Unreadable
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -78,23 +78,3 @@ def test_a_position_that_is_not_known_counts_as_silence() -> None:
 def test_a_place_that_the_map_has_not_is_left_out(place: tuple[float, float]) -> None:
     with pytest.raises(Unreadable, match="is not on the map"):
         heard(reader(FIX), fix(*place))
-
-
-@pytest.mark.parametrize(
-    ("map", "says"),
-    [
-        ({"latitude": 1.0}, "needs either latitude and longitude, or crs with x and y"),
-        (AACHEN | {"crs": "EPSG:25832"}, "needs either latitude and longitude, or crs"),
-        (AACHEN | {"x": 1.0}, "has x or y, which belong to crs"),
-        (AACHEN | {"latitude": 91.0}, "less than or equal to 90"),
-        ({"crs": "EPSG:1"}, "EPSG:1 or EPSG:4326 is not a reference system that PROJ knows"),
-        ({"crs": "EPSG:4326"}, "EPSG:4326 is not in metres; name a projected reference system"),
-        ({"crs": "EPSG:2264"}, "EPSG:2264 is not in metres"),
-        (AACHEN | {"datum": "EPSG:25832"}, "datum EPSG:25832 is not in degrees"),
-        ({"crs": "/etc/passwd"}, "cannot be used here; write"),
-    ],
-)
-def test_a_mistake_of_the_map_is_told(map: dict[str, Any], says: str) -> None:
-    with pytest.raises(InvalidInput) as caught:
-        reader(FIX, map)
-    assert says in str(caught.value)

@@ -13,11 +13,11 @@ from demandops.base.errors import Fault, InvalidInput
 from demandops.cli.authoring import schema
 from demandops.detect import rule_file
 from demandops.detect.condition import entity_in
-from demandops.detect.event_engine import MessageReader, Unreadable
+from demandops.detect.message_reader import MessageReader, Unreadable
 from demandops.detect.rule_file import POSITIONS
 
 from tests.kit import plain_yaml
-from tests.kit.detection import SOURCES, demand, rule, text_of
+from tests.kit.detection import demand, rule, text_of
 
 ROOT = Path(__file__).parents[3]
 NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
@@ -39,8 +39,9 @@ def test_a_mistake_is_told_with_its_line(mistake: dict[str, Any]) -> None:
         del fields["near"]["point"]
     if "demand" in mistake:
         fields["demand"] = demand(**mistake["demand"])
-    told = faults(text_of(rule("a", **fields), sources=mistake.get("sources", SOURCES)))
-    field = f"{'' if 'sources' in mistake else 'rules[0].'}{mistake['field']}".removesuffix(".")
+    file = {name: mistake[name] for name in ("sources", "map") if name in mistake}
+    told = faults(text_of(rule("a", **fields), **file))
+    field = f"{'' if file else 'rules[0].'}{mistake['field']}".removesuffix(".")
     here = [one for one in told if (one.line, one.field) == (mistake["line"], field)]
     assert any(mistake["says"] in one.message for one in here), told
 

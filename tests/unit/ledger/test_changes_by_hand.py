@@ -1,4 +1,4 @@
-"""What people write in Git, an upgrade and a restoration leave of output topics and carriers.
+"""What people write in Git, an upgrade and a restoration leave, and what a change says of itself.
 
 The rules for demands are in ``tests/scenarios``, ``test_flows`` and ``test_properties``.
 """
@@ -6,20 +6,26 @@ The rules for demands are in ``tests/scenarios``, ``test_flows`` and ``test_prop
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import timedelta
 from typing import Any
 
+import pytest
 import yaml
-from demandops.connections.connection import Connection
-from demandops.decide.booking import Restoration
+from demandops.base.errors import Refused
+from demandops.connections.connection import Connection, Route
+from demandops.connections.mqtt import MQTT
+from demandops.decide.booking import Restoration, apply
 from demandops.decide.carriers import with_one_carrier
 from demandops.decide.edits import faults_of_edit
 from demandops.decide.planning.flows import with_booked_topics_marked
-from demandops.model.ledger.claim import Claim, path_of
-from demandops.model.ledger.ledger import ClaimChange, ledger_of
+from demandops.model.demand.demand import UNSTARTED, Demand, Item, Lease
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim, path_of
+from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, ledger_of
 
 from tests.kit.config import skeleton
-from tests.kit.goals import APP, CLOUD, Topic, application, connection, goal
-from tests.kit.memory import MemoryRepo, rebuilt
+from tests.kit.goals import APP, CLOUD, Topic, application, connection, goal, put
+from tests.kit.memory import NOW, MemoryRepo, rebuilt
 
 FRONT, REAR = ("/front/points", "vehicle01"), ("/rear/points", "vehicle01")
 """Two point clouds of a vehicle for which the inventory names no usual topic."""
@@ -175,3 +181,61 @@ def test_a_claim_by_hand_that_doubles_a_route_is_invalid_and_a_restored_one_is_u
         for route in claim.connection.topics
     }
     assert carried == {("old", "/a"), ("new", "/b")}
+
+
+# ---- what a change of claims says about itself ----
+
+
+HELD = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
+
+
+def items_of(*requesters: str, held: Connection = HELD) -> tuple[Item, ...]:
+    return (Item(held, requesters, lease=Lease(60)),)
+
+
+def applied(ledger: Ledger, request: Demand, minutes: int = 0) -> tuple[Ledger, Changes]:
+    return apply(ledger, request, NOW + timedelta(minutes=minutes))
+
+
+def joined(ledger: Ledger, who: str = "v", **changed: Any) -> Ledger:
+    return applied(ledger, Demand("join", "r", items_of(who, held=replace(HELD, **changed))))[0]
+
+
+def test_a_renewed_lease_only_renews_and_a_shutdown_does_not() -> None:
+    ledger, new = applied(Ledger(), Demand("join", "r", items_of("v", "w")), 0)
+    ledger, again = applied(ledger, Demand("join", "r", items_of("v", "w")), 1)
+    _, less = applied(ledger, Demand("shutdown", "r", items_of("v", "w")), 2)
+    renews = [change.only_renews for changes in (new, again, less) for change in changes.claims]
+    assert renews == [False, True, False]
+
+
+def test_a_refusal_suggests_no_claims_of_overrides() -> None:
+    demands = (f"{OVERRIDE_PREFIX}keep", "mine")
+    ledger = rebuilt(Claim(HELD, demand, "r", ("v",), NOW) for demand in demands)
+    with pytest.raises(Refused, match=r"hold, for example, mine$"):
+        applied(ledger, Demand("release", "r", (), "mien", ("v",)))
+
+
+def test_a_reverse_route_delivers_to_the_source() -> None:
+    ledger = joined(Ledger(), topics=(Route("/a", "/b"), Route("/c", "/d", reverse=True)))
+    assert ledger.ids_with("brings", "t", "/b")
+    assert ledger.ids_with("brings", "s", "/c")
+    assert not ledger.ids_with("brings", "t", "/d")
+
+
+def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
+    books = MemoryRepo()
+    decision = books.decide(put("d", lease=60))
+    ledger = books.decide(replace(decision.request, awaits_approval=True)).state.ledger
+    claims = ledger.claims_with("demand", "d")
+    claim = next(one for one in claims if one.is_on_application)
+    assert claim.lease is not None
+    assert claim.lease.until == UNSTARTED
+    assert not claim.lease.has_started
+    text = claim_files.text_of(claim)
+    assert "until" not in text
+    assert claim_files.read(text, claim_files.path_of(claim.key)) == claim
+    assert {one.key for one in ledger.unstarted_claims()} == {one.key for one in claims}
+    later = claim.lease.started(NOW)
+    assert (later.seconds, (later.until - NOW).total_seconds()) == (60, 60)
+    assert ledger.ended_claims(NOW.replace(year=2100)) == ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from datetime import timedelta
 from itertools import permutations
 from pathlib import Path
@@ -76,29 +76,20 @@ def running(repo: MemoryRepo) -> Books:
     return {name: sorted(topics) for name, topics in runs.items()}
 
 
-class Recorded:
-    """One of the two tables of the recorded run: ``books`` (who requests what) or ``runs``.
+def recorded(name: str) -> Iterator[Books]:
+    """Yield a table that DemandOps must have after each step of the recorded run.
 
-    ``theirs`` is the table of the reference after a step, and ``ours`` is the table that DemandOps
-    must have after the step. The record of a step lists only changes: changed entries of
-    ``theirs``, and entries of ``ours`` that begin or cease to differ from ``theirs``.
+    ``name`` is ``books`` (who requests what) or ``runs``. The record of a step lists only changes:
+    changed entries of the reference's table, and entries that begin or cease to differ here.
     """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self.theirs: Books = {}
-        self._differs: dict[str, Any] = {}
-
-    def follow(self, step: dict[str, Any]) -> None:
-        self.theirs = present(self.theirs | step.get(self._name, {}))
-        differs = self._differs | step.get(f"{self._name}_here", {})
-        self._differs = {name: what for name, what in differs.items() if what != "same"}
-        for name, what in self._differs.items():
-            assert what != self.theirs.get(name), f"{name} does not differ here"
-
-    @property
-    def ours(self) -> Books:
-        return present(self.theirs | self._differs)
+    theirs, differs = dict[str, list[str]](), dict[str, Any]()
+    for step in RUN["steps"]:
+        theirs = present(theirs | step.get(name, {}))
+        differs |= step.get(f"{name}_here", {})
+        differs = {entry: what for entry, what in differs.items() if what != "same"}
+        for entry, what in differs.items():
+            assert what != theirs.get(entry), f"{entry} does not differ here"
+        yield present(theirs | differs)
 
 
 def present(books: dict[str, Any]) -> Books:
@@ -106,17 +97,14 @@ def present(books: dict[str, Any]) -> Books:
 
 
 def test_what_comes_of_a_recorded_run_of_the_reference_here() -> None:
-    repo = MemoryRepo()
-    books, runs = Recorded("books"), Recorded("runs")
-    for number, step in enumerate(RUN["steps"], 1):
+    repo, both = MemoryRepo(), zip(recorded("books"), recorded("runs"), strict=True)
+    for number, (step, (books, runs)) in enumerate(zip(RUN["steps"], both, strict=True), 1):
         wanted = step["goal"]
         if isinstance(wanted, str):
             wanted = plain_yaml.load((ROOT / wanted).read_text())
-        books.follow(step)
-        runs.follow(step)
         repo.take(wanted, NOW + timedelta(minutes=2 * number))
-        assert counted(repo.state.ledger) == books.ours, number
-        assert running(repo) == runs.ours, number
+        assert counted(repo.state.ledger) == books, number
+        assert running(repo) == runs, number
 
 
 def test_the_recorded_run_shows_every_difference_that_the_page_explains() -> None:

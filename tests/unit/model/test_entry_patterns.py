@@ -1,6 +1,7 @@
 """Nodes and brokers that nobody listed: one entry of the inventory stands for many.
 
-The mistakes in such an entry are in ``config-mistakes.yaml``.
+The mistakes in such an entry are in ``config-mistakes.yaml``, and the ids for which a demand is
+refused in ``tests/scenarios/nodes-by-a-pattern.yaml``.
 """
 
 from __future__ import annotations
@@ -9,7 +10,6 @@ import json
 from typing import Any
 
 import jsonschema_rs
-import pytest
 import yaml
 from demandops.cli.authoring import schema
 from demandops.decide.warnings import truth_warnings
@@ -80,58 +80,6 @@ def test_an_editor_accepts_placeholders_in_place_of_any_value() -> None:
         wrong = files[path].replace("'{n}'", "'n'")
         assert wrong != files[path]
         assert [*validator.iter_errors(yaml.safe_load(wrong))]
-
-
-REFUSED = {
-    "vehicle": "is not in inventory/nodes.yaml",
-    "vehicle0 7": "is not in inventory/nodes.yaml",
-    "vehicle0/7": "is not in inventory/nodes.yaml",
-    "vehicle07\n": "is not in inventory/nodes.yaml",
-    "vehicle{n}": "is not in inventory/nodes.yaml",
-    "vehicle٣": "is not in inventory/nodes.yaml",
-    "vehicle0-7": "nodes[1].topics.ego_data: '/vehicles/vehicle0-7/ego_data' is not a topic name",
-    "vehicle0..7": "contains '..'",
-    "truck0.": "the id is not a valid label value",
-    "truck" + "7" * 60: "the id is not a valid label value",
-    "vehicle07_x": "nodes[1].position.x: input should be a valid number",
-    "truck07_a": "matches 'truck{n}' in inventory/nodes.yaml: nodes[2] and 'truck{n}_a' in",
-    "bus1": "is in the access domains 'buses' by 'bus*' and 'rest' by 'b*'; narrow",
-    "tram1": "is not in any access domain",
-}
-
-
-@pytest.mark.parametrize(("node", "reason"), REFUSED.items())
-def test_an_id_gives_exactly_one_valid_node(node: str, reason: str) -> None:
-    patterns = ("vehicle{n}", "truck{n}", "truck{n}_a", "bus{n}", "tram{n}")
-    plain = {"type": "vehicle", "cluster": "c-its"}
-    entries = ({"id": id} | (VEHICLE if "vehicle" in id else plain) for id in patterns)
-    domains = [
-        {"name": "buses", "namespace": "buses", "nodes": ["bus*"]},
-        {"name": "rest", "namespace": "rest", "nodes": ["edge", "b*", "truck*", "vehicle*"]},
-    ]
-    policy = {"apiVersion": "demandops/v1", "kind": "AccessDomains", "domains": domains}
-    files = inventory(*entries) | {"policy/access-domains.yaml": yaml.safe_dump(policy)}
-    assert reason in "\n".join(MemoryRepo(files).faults(put("d", "any", topic=("/ego", node))))
-
-
-@pytest.mark.parametrize(
-    ("node", "reason"),
-    {
-        "v07_a": "'v07_a' matches 'v{n}' in inventory/brokers.yaml: brokers[1] and 'v{n}_a'",
-        "v..7": "'v..7' is no broker of the pattern 'v{n}': inventory/brokers.yaml: ",
-    }.items(),
-)
-def test_no_other_broker_takes_the_place_of_one_that_no_pattern_gives(
-    node: str, reason: str
-) -> None:
-    patterns = ({"node": id, "host": "{id}.fleet"} for id in ("v{n}", "v{n}_a"))
-    nodes = [{"id": f"v{n}", "type": "vehicle", "cluster": "c-its"} for n in (1, "{n}", "{n}_a")]
-    repo = MemoryRepo(inventory(*nodes, brokers=tuple(patterns)))
-    link = {"id": "link", "type": "mqtt", "source": "v1", "target": "edge"}
-    link |= {"broker": node, "topics": [{"source": "/t"}]}
-    demand = {"kind": "Demand", "demand": "d", "requesters": ["v1"], "connections": [link]}
-    assert reason in "\n".join(repo.faults(demand))
-    assert repo.take_all([demand | {"connections": [link | {"broker": "v7"}]}]) == ["booked"]
 
 
 def test_a_placeholder_is_no_word_of_yaml() -> None:

@@ -88,7 +88,8 @@ def test_the_faults_of_the_documentation_are_told() -> None:
     )
     twice = head + more.format("station01") + more.format("vehicle07")
     assert faults(FILES | {ROADSIDE: twice}) in BLOCKS
-    assert faults({"inventory/vehicles.yaml": FILES[VEHICLE]}) in BLOCKS
+    unread = faults({"inventory/vehicles.yaml": FILES[VEHICLE]})
+    assert unread.startswith("inventory/vehicles.yaml: is not read; only <name>.yaml and <name>/")
 
 
 def test_the_folder_alone_is_enough_and_messages_name_it() -> None:

@@ -31,7 +31,7 @@ GOALS = dict(
 )
 PROBES = ("startupProbe", "readinessProbe", "livenessProbe")
 FREE = {
-    *("OverrideFile.values", "Parameter.default", "Application.parameters"),
+    *("OverrideFile.values", "Parameter.default", "Application.parameters", "Discovery.entry"),
     *(f"{kind}ClientSettings.{probe}" for kind in ("", "Mqtt") for probe in PROBES),
 }
 FREE_PLACES = (

@@ -1,7 +1,4 @@
-"""What ``demandops check`` warns of in a valid configuration.
-
-``policy-warnings.yaml`` and ``request-warnings.yaml`` list it.
-"""
+"""What is warned of in a valid configuration and in a demand; YAML files list it."""
 
 from __future__ import annotations
 
@@ -15,10 +12,12 @@ from demandops.model.config.load import load
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, state_of
 from tests.kit.connections import demand, routes
+from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 from tests.unit.model.test_config_mistakes import APPDEF, changed
 
 CASES = plain_yaml.beside(__file__, "policy-warnings")
+MISSPELLED = plain_yaml.beside(__file__, "misspelled-topics")
 REQUESTS = plain_yaml.beside(__file__, "request-warnings")
 
 
@@ -46,31 +45,7 @@ def test_requests_that_no_node_or_pod_has_are_told(name: str) -> None:
         assert words in one
 
 
-_VALUES = "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"
-_CHART = "appdefs/object-detection-fusion/charts/object-fusion/values.yaml"
-
-
-@pytest.mark.parametrize(
-    ("live", "changes", "words"),
-    [
-        ("inputs", {}, []),
-        ("serviceAccount", {}, []),  # of the chart
-        ("parameters", {}, []),  # of its library
-        ("input", {}, ["'input' is no value that", "did you mean 'inputs'?"]),
-        ("seldom", {}, ["'seldom' is no value that appdefs/", "correct it, or remove it"]),
-        (
-            "seldom",
-            {_VALUES: {"inputs:": "…\n{% if false %}\nseldom: 1\n{% endif %}\ninputs:"}},
-            [],
-        ),
-        (
-            "parameters",
-            {_VALUES: {"inputs:": "reconfigure: restart\n…"}},
-            ["write `reconfigure: live`"],
-        ),
-        ("parameters", {_CHART: {"inputs:": "reconfigure: restart\n…"}}, ["restarts the pods, as"]),
-    ],
-)
+@pytest.mark.parametrize(("live", "changes", "words"), plain_yaml.beside(__file__, "live-warnings"))
 def test_a_live_value_that_does_not_exist_is_told(
     live: str, changes: dict[str, Any], words: list[str]
 ) -> None:
@@ -90,3 +65,22 @@ def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
     found = map(str, warnings.policy_warnings(state_of(config, books.state.ledger)))
     (told,) = [one for one in found if "no rule of access domain 'fleet' has 'city' among" in one]
     assert told.endswith("claims on such connections stay in effect: 1")
+
+
+@pytest.mark.parametrize("role", ["point_cloud", "ego_data", ""])
+@pytest.mark.parametrize(("source", "topic", "known", "meant"), MISSPELLED)
+def test_a_topic_is_told_if_it_is_probably_a_misspelling_of_a_known_one(
+    source: str, topic: str, known: list[str], meant: str, role: str
+) -> None:
+    """As an input of an application, and on a connection alone."""
+    books = MemoryRepo()
+    for number, one in enumerate([*known, topic]):
+        link = {"id": f"c{number}", "source": source, "target": "edge", "topics": [{"source": one}]}
+        demand = put(f"d{number}", applications=[], connections=[link])
+        if role:
+            demand = put(f"d{number}")
+            demand["applications"][0]["inputs"] = {role: [{"topic": one, "source": source}]}
+        decision = books.send(demand)
+    told = f"'{source}' is not known to publish {topic}; did you mean '{meant}'?"
+    warned = [text for text in decision.warnings if "did you mean" in text]
+    assert [told in text for text in warned] == [True] * bool(meant)

@@ -140,3 +140,24 @@ def test_check_renders_all_templates_although_nobody_demands_them() -> None:
     with pytest.raises(InvalidInput) as invalid:
         try_configuration(state_of(load(configuration(dict(changed)))))
     assert [str(found).split(":")[0] for found in invalid.value.faults] == [*both]
+
+
+def test_each_listed_version_is_rendered_before_anybody_asks_for_it() -> None:
+    folder = "appdefs/object-detection-fusion/charts/next"
+    next = f"    channels: {{next: {{folder: {folder}, version: 9.0.0}}}}\n"
+    chart = {
+        f"{folder}/Chart.yaml": "apiVersion: v2\nname: object-fusion\nversion: 9.0.0\n",
+        f"{folder}/values.schema.json": json.dumps({"required": ["missing"]}),
+        "registry/charts.yaml": skeleton()["registry/charts.yaml"] + next,
+    }
+    pinned = {"1.0.0": {}, "3.0.0": {"charts": {"object-fusion": "9.0.0"}}}
+    versions = {"apiVersion": "demandops/v1", "kind": "Versions"}
+    versions |= {
+        "applications": {"object-detection-fusion": {"default": "1.0.0", "versions": pinned}}
+    }
+    files = chart | {"registry/versions.yaml": json.dumps(versions)}
+    with pytest.raises(InvalidInput) as invalid:
+        try_configuration(MemoryRepo(files).state)
+    (found,) = invalid.value.faults
+    assert found.file == "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"
+    assert '"missing" is a required property' in found.message

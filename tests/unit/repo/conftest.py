@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 import pygit2
 import pytest
@@ -17,7 +16,7 @@ NOW = datetime(2026, 3, 1, 12, 0, 7, tzinfo=timezone.utc)
 
 
 class Desk(MemoryRepo):
-    """A repo in memory, with short methods that send a join or a leave for one application."""
+    """A repo in memory, with a short method that sends a join for one application."""
 
     def join(
         self,
@@ -25,13 +24,9 @@ class Desk(MemoryRepo):
         id: str = "intersection",
         application: str = "edge/fusion",
         cloud: str = "/stations/station00/pointcloud",
-        shutdown: bool = False,
     ) -> Decision:
         app = goals.application(application, who=requesters, clouds=[(cloud, "station00")])
-        return self.send(goals.goal([app], id=id, shutdown=shutdown))
-
-    def leave(self, *requesters: str, **options: Any) -> Decision:
-        return self.join(*requesters, shutdown=True, **options)
+        return self.send(goals.goal([app], id=id))
 
 
 @pytest.fixture

@@ -18,22 +18,27 @@ from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestio
 from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.base.settings import GENERATED_ROOTS
+from demandops.base.settings import GENERATED_ROOTS, MAIN_BRANCH
 from demandops.base.strict_yaml import faults_in, read_input
 from demandops.cli import target
 from demandops.cli.changes import person_change
 from demandops.cli.changes.person_change import Options, changing, propose_option, writable
 from demandops.cli.output import read_by
+from demandops.cli.queries.commits import in_effect
 from demandops.cli.target import all_names, names_of
 from demandops.decide.booking import Drain
 from demandops.decide.placement import relocation
 from demandops.decide.state import State
 from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
 from demandops.model.config.config import NODES_FILE
+from demandops.model.config.discovered import is_discovered
 from demandops.model.config.entry_patterns import may_match
+from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.ledger.claim import LEDGER_ROOT
+from demandops.repo import reader
+from demandops.repo.reader import Reader
 from demandops.views.vocabulary import Json, override_data
 
 # ---- what the commands share: their options and selection ----
@@ -53,6 +58,12 @@ selecting = target.name_options(
 
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
     return {name: list(values) for name, values in given.items() if values}
+
+
+def _options_for(repo: Reader, name: str) -> str:
+    # what a name means that was given without an option
+    kinds = [kind for kind in _SELECTED if name in all_names(repo, f"{kind}s")]
+    return " or ".join(f"--{kind} {shlex.quote(name)}" for kind in kinds)
 
 
 def ends_at(text: str | None) -> str | None:
@@ -257,7 +268,11 @@ def _end(
             message = "is not valid, so nothing is overridden; correct or remove the file with git"
             raise InvalidInput.at("", message, file=_path_of(name))
         if override is None:
-            message = f"there is no override '{name}'{suggestion(name, overrides)}"
+            close = suggestion(name, overrides)
+            message = f"there is no override '{name}'; did you mean: {_options_for(repo, name)}"
+            message = (
+                message if _options_for(repo, name) else f"there is no override '{name}'{close}"
+            )
             raise InvalidInput.at("", message)
         # a person may have changed what the file selects since it was suspended
         selects = [select.model_dump(exclude_none=True).items() for select in override.select]
@@ -280,7 +295,7 @@ def name_of(selected: Mapping[str, tuple[str, ...]]) -> str:
     return "suspend-" + naming.slug_with_hash(words, repr(chosen), 6)
 
 
-@click.command()
+@click.command(context_settings={"allow_extra_args": True})
 @selecting
 @until_option
 @editing
@@ -297,6 +312,11 @@ def suspend(expires: str | None, options: Options, **selected: tuple[str, ...]) 
       demandops suspend --application 'edge/*' --until 2h -m "Service"
       demandops suspend --connection vehicle00/edge -m "Too much data" --propose
     """
+    if names := click.get_current_context().args:
+        with reader.opened(options.state_repo, only_read=True) as repo:
+            meant = _options_for(repo, names[0])
+        told = f"; did you mean: {meant}" if meant else ""
+        raise click.UsageError(f"say by an option what {quoted(names[0])} is{told}")
     effect = {"expires": expires, "deny": True}
     _create(name_of(selected), f"Suspend {described(selected)}", selected, effect, options)
 
@@ -358,6 +378,12 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             )
             raise StateRepoError(message)
         path = config.file_of(NODES_FILE, host)
+        if is_discovered(path):
+            verb = "cordon" if drained else "uncordon"
+            way = shlex.join(["kubectl", verb, "-l", f"{NODE_LABEL}={host}"])
+            cluster = config.nodes[host].cluster
+            message = f"'{host}' is as cluster '{cluster}' has it; there, run: {way}"
+            raise StateRepoError(message)
         text = repo.file_reader()(path) or ""
         try:
             changed = strict_yaml.set_flag(text, "nodes", host, "drained", drained)
@@ -384,16 +410,17 @@ _node = click.argument("node", metavar="NODE", shell_complete=names_of("nodes"))
 @_node
 @editing
 def drain(node: str, options: Options) -> None:
-    """Take a node out of use: nothing new is placed there.
+    """Take a node out of use: the generator places nothing there.
 
     The command sets `drained: true` in the inventory. The generator then moves away what it placed
-    on the node. What a demand itself put on the node stays; `demandops release` or `demandops
-    decommission` ends that.
+    on the node, and places nothing there. What a demand names the node for stays, and such demands
+    are still accepted; an override with `--on` moves it, and `demandops release` ends it.
 
     \b
     Examples:
       demandops drain edge --dry-run
       demandops drain edge -m "Maintenance"
+      demandops override create off-edge --node edge --on cloud -m "Maintenance"
     """
     _set_drained(node, True, options)
 
@@ -434,20 +461,24 @@ def revert(commit: str, options: Options) -> None:
     with writable(options) as repo:
         id = repo.commit(commit)
         entry = next(repo.log(id))
-        demands = entry.trailers.get("Demand-Id", ())
         paths = repo.files_changed_by(id)
         booked = [
             path for path in paths if path.split("/", 1)[0] in (LEDGER_ROOT, *GENERATED_ROOTS)
         ]
         if entry.by_generator or booked:
             who = "a generator made it" if entry.by_generator else f"it changes {booked[0]}"
-            ways = [f"demandops release {shlex.quote(demand)}" for demand in demands]
-            if follows := entry.first("Follows"):  # it carries out what a person committed
-                ways.append(f"demandops revert {follows[:10]}")
-            ways.append(f"demandops rollback {id[:10]}~1 -m REASON")
+            snapshot, demands = repo.snapshot(), entry.trailers.get("Demand-Id", ())
+            held = snapshot.state.ledger.indexed_names("demand")
+            ways = [f"demandops release {shlex.quote(name)}" for name in demands if name in held]
+            # what carries out a person's commit, or says that it is not valid, booked nothing
+            follows = entry.first("Follows")
+            back = f"revert {follows[:10]}" if follows else f"rollback {id[:10]}~1 -m REASON"
+            ways.append(f"demandops {back}")
             message = (
                 f"{id[:10]} is not undone by a revert, because {who}; run: {' or '.join(ways)}"
             )
+            if snapshot.faults:
+                message += f"; {MAIN_BRANCH} is not valid: {in_effect(repo, snapshot)}"
             raise StateRepoError(message)
         before, after, now = (repo.file_reader(each) for each in (f"{id}~1", id, None))
         if changed := [path for path in paths if now(path) != after(path)]:

@@ -12,9 +12,10 @@ from typing import Any
 
 import click
 
-from demandops.base.errors import InvalidInput, Refused
+from demandops.base.errors import InvalidInput, Refused, StateRepoError
 from demandops.base.naming import SubjectKind
 from demandops.base.runtime import REAL
+from demandops.base.settings import MAIN_BRANCH
 from demandops.cli.changes.person_change import (
     Options,
     changing,
@@ -274,9 +275,12 @@ def decommission(name: str, kind: str | None, options: Options) -> None:
 
 # ---- ``demandops rollback``: restore the ledger of an earlier commit ----
 
+# How many newer commits of people are named, which a rollback leaves.
+_MOST_EDITS = 5
+
 
 @click.command()
-@click.argument("revision", metavar="REV|TIME")
+@click.argument("revision", metavar="[REV|TIME]", default="", required=False)
 @name_options(
     {
         "demand": "Roll back only this demand.",
@@ -300,29 +304,50 @@ def rollback(
     Claims that were released after the earlier commit are booked again, with the current
     configuration. Claims that were booked or changed after it prevent the rollback, unless
     you give --drop-newer. The lease of a restored claim starts again with its full term. REV is a
-    commit. TIME selects the newest commit at or before this time.
+    commit. TIME selects the newest commit at or before this time. Without both, --demand or
+    --application means the commit before its last change.
 
     \b
     Examples:
       demandops rollback 14:00 --dry-run
       demandops rollback 14:00 -m "The station sent nonsense"
       demandops rollback 2h -m "A wrong test" --demand visit
+      demandops rollback --application edge/object_detection_fusion -m "The last change was wrong"
       demandops rollback 2h -m "A wrong test" --drop-newer --yes
     """
     if demand and application:
         raise click.UsageError("give --demand or --application, not both")
     if not options.dry_run:
         options = options.with_reason()
-    to, since = "", list[str]()
+    if not (revision or demand or application):
+        raise click.UsageError("give REV or TIME, or --demand or --application")
+    to, since, edits = "", list[str](), list[str]()
 
     def goal_of(repo: Reader, state: State) -> Goal:
-        nonlocal to, since
-        to = resolved(repo, revision)
+        nonlocal to, since, edits
+        about = (
+            each.commit
+            for each in repo.log()
+            if application in each.trailers.get("Application", ())
+            or (demand and any(id.startswith(demand) for id in each.trailers.get("Demand-Id", ())))
+        )
+        try:
+            to = resolved(repo, revision or f"{next(about, MAIN_BRANCH)}~1")
+        except StateRepoError as error:
+            held = {
+                "demand": state.ledger.indexed_names("demand"),
+                "application": state.ledger.subjects(SubjectKind.APPLICATION),
+            }
+            for kind in (kind for kind, names in held.items() if revision in names):
+                way = f"demandops rollback --{kind} {shlex.quote(revision)} -m REASON"
+                raise StateRepoError(f"{error}; did you mean: {way}") from None
+            raise
         since = repo.changed_files(to, repo.commit(), CONFIG_ROOTS)
-        named = {"application": application}
+        people = (each.commit for each in repo.log(f"{to}..") if since and not each.by_generator)
+        edits = [each for each in people if not {*since}.isdisjoint(repo.files_changed_by(each))]
+        only = {"application": application} if application else {}
         if demand:
-            named["demand"] = _meant(demand, ["demand"], state, repo.snapshot(to).state)
-        only = {key: id for key, id in named.items() if id}
+            only["demand"] = _meant(demand, ["demand"], state, repo.snapshot(to).state)
         who = repo.operator()
         return goals.rollback(to, drop_newer=drop_newer, reason=options.reason, who=who, **only)
 
@@ -347,4 +372,5 @@ def rollback(
             f"different from those at {to[:10]}:"
         )
         lines += [f"  {path}" for path in since]
+        lines += [f"to undo that: demandops revert {edit[:10]}" for edit in edits[:_MOST_EDITS]]
     show(options.output, {"to": to, **data, "configuration_since": since}, lines)

@@ -204,7 +204,7 @@ def entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
     *("join", "shutdown", "put", "release", "renew", "expire", "wait", "decommission", "drain"),
-    *("follow", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
+    *("follow", "discover", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
 )
 
 _TRAILERS = {
@@ -286,7 +286,10 @@ def log(
     """
     with reader.opened(state_repo) as repo:
         for side in filter(None, (commit_range or "").split("..")):
-            resolved(repo, side)
+            try:
+                resolved(repo, side)
+            except BeforeTheFirst as error:
+                errors.print(str(error))
         release, path = given.pop("release"), None
         if release is not None:
             tip = repo.commit((commit_range or "").rpartition("..")[2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial, reduce
@@ -122,7 +123,11 @@ def with_moves(
             attempts += 1
             # What cannot move holds up nothing else.
             if fixed := next(filter(None, (_why_fixed(c, node, service) for c in claims)), ""):
-                stays.append(f"{what[0]} stays, because {fixed}")
+                # what an override moved runs elsewhere already
+                here = [each.name for each in definitions.values() if each.is_movable]
+                here = [service.name] if service else [*{*here} - {*app.services}]
+                if not here or any(app.moved.get(name, node) == node for name in here):
+                    stays.append(f"{what[0]} stays, because {fixed}")
                 continue
             # another node is chosen by what all the claims require and read
             apps = [claim.application for claim in claims]
@@ -154,14 +159,16 @@ def with_moves(
 
 def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
     app = claim.application
+    way = shlex.join(["demandops", "override", "create", "NAME", "--node", node, "--on", "NODE"])
+    named, way = f"demand '{claim.demand}' names the node", f"; to move it: {way} -m REASON"
     if service is not None:
-        return f"demand '{claim.demand}' names the node" if service.name in app.named else ""
+        return named + way if service.name in app.named else ""
     if claim.keeping_override:
         return f"the override '{claim.keeping_override}' keeps it"
     if app.place is None:  # a claim has this only if the generator chose the node
-        return f"demand '{claim.demand}' names the node"
+        return named + way
     here = [name for name in app.named if name not in app.services]
-    return f"demand '{claim.demand}' names the node of {candidates.joined(here)}" if here else ""
+    return f"{named} of {candidates.joined(here)}{way}" if here else ""
 
 
 def applications_of(ledger: Ledger, node: str) -> list[str]:

@@ -66,7 +66,7 @@ def collection_of(path: str) -> str | None:
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
     # for example `inventory/nodes.yaml or inventory/nodes/`
-    used = {*files} or {collection}
+    used = {file for file in {*files} if collection_of(file) == collection} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
     return " or ".join([collection] * (collection in used) + folder)
 

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -128,9 +129,13 @@ class EntryPattern(Generic[Entry]):
         values = values_in(self.id, id)
         return values and {**values, "id": id}
 
-    def entry(self, id: str) -> Entry:
-        """Return the entry of an id that matches; raise ``InvalidInput`` with its faults."""
+    def entry(self, id: str, own: Mapping[str, Any] = MappingProxyType({})) -> Entry:
+        """Return the entry of an id that matches; raise ``InvalidInput`` with its faults.
+
+        The fields ``own`` are those of this id alone.
+        """
         data: Any = filled(self.data, self.values(id) or {})
+        data |= own
         try:
             try:
                 return self.model.model_validate(data)
@@ -170,7 +175,7 @@ class EntryPattern(Generic[Entry]):
                 return self.entry(id).model_copy(update={self.key: self.id})
             except InvalidInput as error:
                 errors.append(error)
-        raise errors[0]
+        raise min(errors, key=lambda error: len(error.faults))  # some only concern a digit
 
 
 def _read_number(

@@ -276,11 +276,45 @@ _LABEL_VALUE = re.compile(r"([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?")
 LabelValue = Annotated[str, StringConstraints(pattern=f"^{_LABEL_VALUE.pattern}$")]
 
 
+# What a cluster says itself of each node
+_FROM_CLUSTER = ("id", "cluster", "selector", "drained")
+
+
+class Discovery(CamelModel):
+    """How the nodes of a cluster become nodes of the inventory (:mod:`.discovered`)."""
+
+    # the labels of the nodes that are taken over, besides `node_id`, which has the id
+    selector: dict[LabelKey, LabelValue] = Field(default_factory=dict)
+    # for how long a node that the cluster no longer has stays, drained
+    gone_after: Annotated[str, base_model.readable_by(base_model.seconds_of)] = "10m"
+    # which label says what; `capability.demandops/<word>` and `property.demandops/<name>` always do
+    type_label: LabelKey = "demandops/type"
+    capability_labels: dict[Word, LabelKey] = Field(default_factory=dict)
+    property_labels: dict[PropertyName, LabelKey] = Field(default_factory=dict)
+    # what each of these nodes has besides, such as its topics; the texts may have `{id}`
+    entry: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _complements(self) -> Discovery:
+        for name in _FROM_CLUSTER:
+            if name in self.entry:
+                raise ValueError(f"'{name}' of 'entry' comes from the cluster; remove it")
+        return self
+
+
 class Cluster(CamelModel):
     """A Kubernetes cluster whose GitOps controller reads ``clusters/<name>/``."""
 
     name: DnsLabel
     description: Text = ""
+    nodes: Literal["listed", "from-cluster"] = "listed"
+    discovery: Discovery | None = None
+
+    @model_validator(mode="after")
+    def _discovers(self) -> Cluster:
+        if self.discovery and self.nodes == "listed":
+            raise ValueError("'discovery' needs 'nodes: from-cluster'; add that, or remove it")
+        return self
 
 
 class Toleration(CamelModel):

@@ -16,7 +16,7 @@ from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION, RENDER_VERSION
 from demandops.model.config import config as configs
-from demandops.model.config import inventory, registry
+from demandops.model.config import discovered, inventory, registry
 from demandops.model.config.appdef import (
     ApplicationDefinition,
     ServiceDefinition,
@@ -62,7 +62,11 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         )
         reader.add_fault(ROOT_FILE, repository.gitops, message)
     _refuse_unread(reader)
+    clusters = reader.read_items(
+        configs.CLUSTERS_FILE, inventory.ClustersFile, "clusters", inventory.Cluster, "name"
+    )
     nodes = reader.read_items(configs.NODES_FILE, inventory.NodesFile, "nodes", Node, "id")
+    nodes |= discovered.read_nodes(reader, clusters, nodes)
     domains = reader.read_items(
         configs.DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name"
     )
@@ -106,9 +110,6 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         name: _services_of(appdef, definitions, all_nodes, settings, reader)
         for name, appdef in appdefs.items()
     }
-    clusters = reader.read_items(
-        configs.CLUSTERS_FILE, inventory.ClustersFile, "clusters", inventory.Cluster, "name"
-    )
     brokers = reader.read_items(
         configs.BROKERS_FILE, inventory.BrokersFile, "brokers", inventory.Broker, "node"
     )
@@ -169,7 +170,8 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     )
     cross_check(config, reader)
     if reader.faults:
-        raise InvalidInput(dict.fromkeys(reader.faults))
+        faults = (discovered.in_entry(each, reader, clusters) for each in reader.faults)
+        raise InvalidInput(dict.fromkeys(faults))
     return config
 
 
@@ -179,6 +181,8 @@ def _refuse_unread(reader: ConfigReader) -> None:
     for path in sorted(reader.files):
         folder, *names = path.split("/")
         if folder not in folders or not path.endswith((".yaml", ".yml")):
+            continue
+        if discovered.is_discovered(path):  # people see with `check` that they may not edit it
             continue
         if configs.collection_of(path) is None and not any(name.startswith(".") for name in names):
             stems = [
@@ -326,12 +330,14 @@ def _domains_of_nodes(
             matching.setdefault(name, pattern)
             if len(matching) > _MOST_DOMAINS:
                 break
+        file, place = reader.places[configs.NODES_FILE][node]
+        if len(matching) > 1 and discovered.is_discovered(file):
+            continue  # a label in a cluster must not make people's files invalid
         if len(matching) > 1:  # an overlap by accident must not move the node
             by = " and ".join(
                 f"'{name}' by {quoted(pattern)} in {reader.places[configs.DOMAINS_FILE][name][0]}"
                 for name, pattern in sorted(matching.items())[:_MOST_DOMAINS]
             )
-            file, place = reader.places[configs.NODES_FILE][node]
             message = (
                 f"'{node}' is in the access domains {by}; narrow these patterns so that only one "
                 "domain matches the node, and list the other domains under 'accessDomains' of the "

@@ -15,6 +15,7 @@ from demandops.base.quoting import escaped, harmless, is_visible, one_line
 from demandops.base.settings import RENDER_VERSION
 from demandops.decide.booking import Drain, Restoration
 from demandops.decide.decision import Decision
+from demandops.decide.discovery import Discovered
 from demandops.decide.state import ReleaseChange
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.model.demand.demand import Application, Decommission, Held
@@ -109,6 +110,7 @@ _MAX_AUTHOR = 200
 _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
 _MOST_PROBLEMS = 20
+_MOST_NODES = 50
 _UNCHANGED = "Desired state: unchanged."
 _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 _CRUD = " .,:;\"'\\"  # Git removes these at both ends of a name, and refuses an empty name
@@ -363,6 +365,32 @@ def of_override_end(
         *override_trailers([override.path], keys),
         *demand_trailers(keys),
         *more,
+        ("Render-Version", str(RENDER_VERSION)),
+    ]
+    return compose(paragraphs, trailers)
+
+
+def of_discovery(found: Sequence[Discovered], releases: tuple[ReleaseChange, ...]) -> str:
+    names = [each.path.rpartition("/")[2].removesuffix(".yaml") for each in found]
+    counts = [
+        (sum(len(getattr(each, field)) for each in found), word)
+        for field, word in (("came", "came"), ("left", "left"), ("changed", "changed"))
+    ]
+    told = ", ".join(f"{count} {word}" for count, word in counts if count) or "as they are"
+    paragraphs = [
+        [one_line(f"Nodes of {', '.join(names)}: {told}", _MAX_SUBJECT)],
+        [f"Why: {', '.join(names)} said so."],
+    ]
+    for name, each in zip(names, found, strict=True):
+        signed = [("+", each.came), ("-", each.left), ("~", each.changed)]
+        lines = [f"  {sign} {line}" for sign, lines in signed for line in lines]
+        more = len(lines) - _MOST_NODES
+        paragraphs.append([f"{name}:", *lines[:_MOST_NODES]])
+        paragraphs[-1] += [f"  and {more} more"] if more > 0 else []
+    paragraphs.append(_desired_state(releases) if releases else [_UNCHANGED])
+    trailers = [
+        ("Operation", "discover"),
+        *(("Cluster", name) for name in names),
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return compose(paragraphs, trailers)

@@ -34,6 +34,7 @@ from demandops.decide.state import (
     try_configuration,
 )
 from demandops.model.config.config import CONFIG_ROOTS, Config
+from demandops.model.config.discovered import DISCOVERED_ROOT, is_discovered
 from demandops.model.config.load import load as load_config
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
@@ -391,7 +392,7 @@ def follow(
     claims = trees.commit_of(repo, before.commit).tree, tree, (claim_files.LEDGER_ROOT,)
     if ids != before.refused or again or trees.differ(*claims):
         try:
-            config = _judged(tree, before.state)
+            config = _judged(tree, trees.commit_of(repo, before.commit).tree, before.state)
             state = replace(before.state, config=config)
             return _carried_out(repo, before, Snapshot(to, state, to, told=before.told), now)
         except InvalidInput as error:
@@ -425,14 +426,20 @@ _judgements: dict[object, Config | InvalidInput] = {}
 _MOST_JUDGED = 8
 
 
-def _judged(tree: Tree, before: State) -> Config:
-    """Return the configuration of people's commit if it can be used, whatever is demanded."""
+def _judged(tree: Tree, earlier: Tree, before: State) -> Config:
+    """Return the configuration of people's commit if it can be used, whatever is demanded.
+
+    What clusters say of their nodes is that of the tree ``earlier``; people's edits are put back.
+    """
     in_effect = before.config.repo_settings.render_version
-    key = (config_ids(tree), in_effect, frozenset(before.ledger.ended.items()))
+    of_clusters = trees.entry_id(earlier, DISCOVERED_ROOT)
+    key = (config_ids(tree), of_clusters, in_effect, frozenset(before.ledger.ended.items()))
     judgement = _judgements.get(key)
     if judgement is None:
         try:
             files = trees.texts(tree, CONFIG_ROOTS)
+            files = {path: text for path, text in files.items() if not is_discovered(path)}
+            files |= trees.texts(earlier, (DISCOVERED_ROOT,))
             if ROOT_FILE not in files:
                 raise InvalidInput([fault("", NO_STATE_REPO).within(ROOT_FILE)])
             config = load_config(files)
@@ -463,14 +470,14 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
     InvalidInput is raised if a release cannot be planned or rendered with it.
     """
     commit, old = trees.commit_of(repo, wanted.commit), before.state
-    tree = commit.tree
+    tree, earlier = commit.tree, trees.commit_of(repo, before.commit).tree
     read = _read_ledger(repo, before, commit)
     state = read.state_with(old, wanted.state.config)
     renders_all = (
         state.config != old.config
         or state.ledger.ended != old.ledger.ended
         or not before.is_rendered
-        or trees.differ(trees.commit_of(repo, before.commit).tree, tree, GENERATED_ROOTS)
+        or trees.differ(earlier, tree, GENERATED_ROOTS)
     )
 
     def carry_out(
@@ -511,6 +518,10 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
         claim_files.path_of(change.key): change.before for change in refused
     }
     files: dict[str, str | None] = {
+        **{
+            path: trees.read_text(earlier, path)
+            for path, _ in trees.differences(earlier, tree, (DISCOVERED_ROOT,))
+        },
         **{path: claim_files.text_of(claim) if claim else None for path, claim in put_back.items()},
         **read.waiting,
         **carried.files,

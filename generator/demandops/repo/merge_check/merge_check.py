@@ -34,6 +34,7 @@ from demandops.decide.state import (
 )
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
+from demandops.model.config.discovered import is_discovered
 from demandops.model.config.load import load
 from demandops.model.config.override import OVERRIDES_ROOT, format_time
 from demandops.model.config.repo_settings import ROOT_FILE
@@ -206,7 +207,7 @@ def _is_written_by_generator(path: str) -> bool:
     if root == claim_files.LEDGER_ROOT:  # people may edit claims and waiting demands
         is_waiting = path.startswith(f"{records.WAITING_ROOT}/")
         return claim_files.kind_of(path) is None and not is_waiting
-    return root in GENERATED_ROOTS
+    return root in GENERATED_ROOTS or is_discovered(path)
 
 
 def _suggestions(
@@ -238,6 +239,11 @@ def _remedy(path: str, before: str | None, after: str | None, suggestion: Sugges
         listed = ", ".join(left[:_MOST_LEFT]) + (", …" if len(left) > _MOST_LEFT else "")
         unchanged = f" (this override does not change {listed})" if left else ""
         return f"{lost}, and merge {suggestion.file} as shown{unchanged}"
+    if is_discovered(path):
+        return (
+            "is written by the generator, as the cluster has its nodes, so a manual edit is lost; "
+            "revert it, and change the node in the cluster, or list it in inventory/nodes.yaml"
+        )
     if root == claim_files.LEDGER_ROOT:
         if before is not None:
             return "is written only by the generator; revert the edit"

@@ -7,7 +7,8 @@ the batch is dropped and its demands are evaluated again on the new tip.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from itertools import islice
@@ -20,15 +21,21 @@ from demandops.base.quoting import one_line
 from demandops.decide import edits
 from demandops.decide.booking import Drain
 from demandops.decide.decision import Decision, decide
-from demandops.decide.state import State
-from demandops.model.config.config import NODES_FILE
+from demandops.decide.discovery import Discovered
+from demandops.decide.state import Changeset, State
+from demandops.model.config.config import CONFIG_ROOTS, NODES_FILE
+from demandops.model.config.discovered import is_discovered
+from demandops.model.config.load import load as load_config
 from demandops.model.config.override import Override
+from demandops.render import gitops
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Followed, Snapshot
+
+log = logging.getLogger("demandops")
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02
@@ -155,6 +162,28 @@ class CommitBatch:
         title = text.partition("\n")[0]
         self.followed = one_line(", ".join([title, *(path for _, path in of_overrides)]))
 
+    def texts(self, root: str) -> dict[str, str]:
+        return trees.texts(self._tree, (root,))
+
+    def take_over(self, found: Sequence[Discovered], now: datetime) -> None:
+        """Commit what clusters say of their nodes; raise InvalidInput if that is not valid here."""
+        before, files = self.head.state, {each.path: each.text for each in found}
+        texts: dict[str, str | None] = {**trees.texts(self._tree, CONFIG_ROOTS), **files}
+        config = load_config({path: text for path, text in texts.items() if text is not None})
+        ids = (id for each in found for id in each.new_ids)
+        if any(before.ledger.claims_needing(id) for id in ids):  # they were of a pattern until now
+            state = State(config, before.ledger, before.evaluate)
+            change = snapshots.render_all(self._tree, state, files)
+        else:
+            state, change = before.with_nodes(config), Changeset(files, ())
+            wanted = gitops.base_files(config)
+            for path in sorted({*gitops.base_files(before.config), *wanted}):
+                if self.read(path) != wanted.get(path):
+                    files[path] = wanted.get(path)
+        text = commit_message.of_discovery(found, change.releases)
+        self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
+        log.info("%s", text.partition("\n")[0])
+
     def end_override(self, override: Override, now: datetime) -> None:
         # InvalidInput is raised if the state without the override cannot be planned or rendered
         state = self.head.state
@@ -174,7 +203,8 @@ class CommitBatch:
             file = config.file_of(NODES_FILE, config.host_of(node))
             changes = commit_log.changes_to(self._objects, self.start.configuration, file)
             by_people = (entry.commit for entry, _, _ in changes if not entry.by_generator)
-            causes = [trees.commit_of(self._objects, each) for each in islice(by_people, 1)]
+            most = 0 if is_discovered(file) else 1  # it was cordoned in its cluster
+            causes = [trees.commit_of(self._objects, each) for each in islice(by_people, most)]
             caused_by = commit_log.caused_by_trailers(causes)
             more = [*caused_by, *self.head.trailers]
             text = commit_message.of_decision(decision, operation, now, more)

@@ -178,8 +178,7 @@ def _commit(
     tree = repository.new.add_tree(tip.tree, files)
     changes_config = any(path.split("/", 1)[0] in CONFIG_ROOTS for path in files)
     if changes_config:
-        # what a person adds to a configuration that is not valid would not be in effect either
-        _require_valid(repository, tip)
+        _require_effect(repository, tip, files)
     who = commit_message.signature(*details.person, details.now)
     text = details.text
     try:
@@ -195,22 +194,28 @@ def _commit(
 def state_after(repository: StateRepository, before: Snapshot, files: Files) -> State:
     """Return what would be in effect after a commit of these files, which nobody makes.
 
-    InvalidInput is raised if their configuration would not be valid, and StateRepoError if that of
-    ``before`` is not.
+    If their configuration would not be valid, StateRepoError is raised if that of ``before`` is not
+    valid either, else InvalidInput.
     """
     objects = repository.reopened()  # it gets the commit in memory
     new, tip = NewObjects(objects), trees.commit_of(objects, before.commit)
-    _require_valid(repository, tip)
     who = commit_message.signature("A person", "person@demandops.invalid", REAL.now())
     tree = new.add_tree(tip.tree, files)
     commit = new.add_commit(None, (who, who), "", tree, [tip.id])
     after = snapshots.follow(objects, before, commit, REAL.now()).snapshot
+    if after.faults and before.faults:
+        raise StateRepoError(
+            f"nothing of {MAIN_BRANCH}'s configuration is in effect, because it is not valid, so "
+            f"nothing was changed: {snapshots.problems_of(objects, before)[0]}; first "
+            f"{snapshots.how_to_mend(objects, before)}"
+        )
     if after.faults:
         raise InvalidInput(with_lines(after.faults, files.get))
     return after.state
 
 
-def _require_valid(repository: StateRepository, tip: Commit) -> None:
+def _require_effect(repository: StateRepository, tip: Commit, files: Files) -> None:
+    # what a person adds to a configuration that stays invalid would not be in effect either
     objects = repository.objects
     try:
         entry = snapshots.newest_of_generator(objects, tip.id)
@@ -220,12 +225,8 @@ def _require_valid(repository: StateRepository, tip: Commit) -> None:
     except InvalidInput:
         pass
     try:
-        held = snapshots.state_at(objects, tip.id)
+        before = snapshots.state_at(objects, tip.id)
     except InvalidInput:
         return  # nothing is in effect yet, so the new files alone are judged
-    if held.faults:
-        raise StateRepoError(
-            f"nothing of {MAIN_BRANCH}'s configuration is in effect, because it is not valid, so "
-            f"nothing was changed: {snapshots.problems_of(objects, held)[0]}; first "
-            f"{snapshots.how_to_mend(objects, held)}"
-        )
+    if before.faults:
+        state_after(repository, before, files)

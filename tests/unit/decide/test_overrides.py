@@ -1,4 +1,4 @@
-"""Overrides of equal priority: who is warned, and what patches make of Helm values."""
+"""Overrides: what patches make of Helm values, who is warned of ties, and what happens to pods."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from demandops.decide.planning.overrides import apply_effects, effects_on
-from demandops.decide.state import trial_releases
+from demandops.decide.state import describe_change, planned_releases, trial_releases
 from demandops.decide.warnings import tied_override_warnings
 from demandops.model.config.override import Override, OverrideFile
 from demandops.model.release import ServiceRelease
@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 
 from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import patches_commute
+from tests.kit.config import override
+from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
 CONFIG = MemoryRepo().config
@@ -30,23 +31,6 @@ json = st.recursive(
 )
 _text = partial(dumps, sort_keys=True)
 patch = st.fixed_dictionaries({}, optional={"k": json, "l": json})
-
-
-# what a chart has below the values: nothing, some defaults, or it is not known
-below = st.none() | patch
-
-
-@given(patch, patch, patch, below)
-@examples(60)
-def test_patches_that_commute_give_the_same_in_either_order(
-    target: dict[str, Any], one: dict[str, Any], other: dict[str, Any], below: dict[str, Any] | None
-) -> None:
-    both = (
-        overridden(overridden(target, one, below), other, below),
-        overridden(overridden(target, other, below), one, below),
-    )
-    if patches_commute(one, other):
-        assert _text(both[0]) == _text(both[1])
 
 
 @given(json, patch)
@@ -143,3 +127,33 @@ def _made(shaped: ServiceRelease) -> tuple[Any, ...]:
         values = overridden(values, patch, None)
     images = {name: shaped.image(name, CONFIG) for name in shaped.service.images}
     return shaped.replicas, shaped.node, shaped.shaping.held, _text(values), images
+
+
+# ---- the effect on pods ----
+
+
+FUSION = "of-edge-fusion-c9b035cdedb8"
+
+
+@pytest.mark.parametrize(
+    ("changed", "effect"),
+    [
+        ({"values": {"inputs": {"egoData": ["/other"]}}}, "reconfigures"),
+        ({"replicas": 0}, "stops"),
+        ({"values": {"inputs": {"egoData": ["/other"]}, "fusion": {"nodeName": "x"}}}, "restarts"),
+        ({"images": {"object-fusion": {"tag": "2"}}}, "restarts"),
+        ({"hold": True}, ""),
+    ],
+)
+def test_an_override_has_the_effect_of_what_it_changes(
+    changed: dict[str, Any], effect: str
+) -> None:
+    text = override({"services": ["object-fusion"]}, **changed)
+    sides = list[tuple[Any, str]]()
+    for repo in (MemoryRepo(), MemoryRepo({"overrides/test.yaml": text})):
+        repo.send(put("fusion"))
+        by_name = {release.name: release for release in planned_releases(repo.state).values()}
+        (path,) = (path for path in repo.files if path.endswith(f"/{FUSION}.yaml"))
+        sides.append((by_name[FUSION], repo.files[path]))
+    (was, current), (now, written) = sides
+    assert describe_change(was, now, current, written).effect == effect

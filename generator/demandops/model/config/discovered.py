@@ -1,0 +1,141 @@
+"""Nodes that a cluster has: the file in which the generator keeps them, and its reader.
+
+``inventory/clusters.yaml`` says for which clusters, and which labels mean what. The generator
+writes what a decision can see of each node into ``inventory/discovered/<cluster>.yaml``. So a
+decision is still a function of repo and demand. To the rest of the program they are listed nodes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Literal
+
+from pydantic import Field
+
+from demandops.base import strict_yaml
+from demandops.base.errors import Fault, InvalidInput
+from demandops.base.settings import API_VERSION
+from demandops.model.config.base_model import CamelModel, FileModel, Items, Moment, Word, parse_file
+from demandops.model.config.config import CLUSTERS_FILE, NODES_FILE, ConfigReader
+from demandops.model.config.entry_patterns import EntryPattern
+from demandops.model.config.inventory import (
+    Cluster,
+    Discovery,
+    Kind,
+    Node,
+    NodeId,
+    PropertyName,
+    PropertyValue,
+    Resources,
+    kind_of,
+)
+
+DISCOVERED_ROOT = "inventory/discovered"
+_NOTE = """\
+# Written by the generator: the nodes as the cluster has them. Edits are put back. To change a node,
+# change it in the cluster, or list it in inventory/nodes.yaml, which replaces its whole entry here.
+"""
+_IN_ENTRY = re.compile(r"nodes\[\d+\]\.(?!id$)(.*)")
+
+
+class DiscoveredNode(CamelModel):
+    """What a cluster says of one node; the rest is in the cluster's ``discovery.entry``."""
+
+    id: NodeId
+    type: Word | None = None
+    capabilities: Items[Word] = ()
+    properties: dict[PropertyName, PropertyValue] = Field(default_factory=dict)
+    capacity: Resources | None = None
+    # whether it is cordoned
+    drained: bool = False
+    # since when the cluster has it no longer; it is drained too
+    gone_since: Moment | None = None
+
+
+class DiscoveredNodesFile(FileModel):
+    """``inventory/discovered/<cluster>.yaml``, which only the generator writes."""
+
+    kind: Literal["DiscoveredNodes"]
+    nodes: Items[DiscoveredNode]
+
+
+def is_discovered(path: str) -> bool:
+    return path.startswith(f"{DISCOVERED_ROOT}/")
+
+
+def path_of(cluster: str) -> str:
+    return f"{DISCOVERED_ROOT}/{cluster}.yaml"
+
+
+def read(text: str | None, path: str) -> tuple[DiscoveredNode, ...]:
+    return parse_file(DiscoveredNodesFile, text, path).nodes if text is not None else ()
+
+
+def text_of(nodes: Iterable[DiscoveredNode]) -> str:
+    data = [
+        node.model_dump(mode="json", by_alias=True, exclude_defaults=True)
+        for node in sorted(nodes, key=lambda node: node.id)
+    ]
+    head = {"apiVersion": API_VERSION, "kind": "DiscoveredNodes"}
+    return _NOTE + strict_yaml.dump({**head, "nodes": data})
+
+
+def read_nodes(
+    reader: ConfigReader, clusters: Mapping[str, Cluster], listed: Mapping[str, Node]
+) -> dict[str, Node]:
+    """Return the discovered nodes that nobody lists; collect the faults of entries and files."""
+    nodes, places = dict[str, Node](), reader.places[NODES_FILE]
+    for name, cluster in sorted(clusters.items()):
+        if cluster.nodes == "listed":  # a file that is left over is removed by the generator
+            continue
+        pattern, path = _pattern(reader, cluster), path_of(name)
+        try:
+            _ = pattern.example  # so that the faults of the entry are those of its file
+            for number, node in enumerate(read(reader.files.get(path), path)):
+                if node.id in places:  # a listed node is meant to differ, as a whole
+                    continue
+                own = node.model_dump(by_alias=True, exclude_defaults=True, exclude={"gone_since"})
+                own["drained"] = node.drained or node.gone_since is not None
+                nodes[node.id] = pattern.entry(node.id, own)
+                places[node.id] = (path, f"nodes[{number}]")
+        except InvalidInput as error:
+            reader.faults += error.faults
+            reader.incomplete.add(NODES_FILE)
+    examples = (pattern.example for pattern in reader.patterns[NODES_FILE])
+    return dict(_of_one_kind(nodes, [*listed.values(), *examples]))
+
+
+def _pattern(reader: ConfigReader, cluster: Cluster) -> EntryPattern[Node]:
+    # also for the first node of a role that no application knows, whatever the cluster says of it
+    file, place = reader.places[CLUSTERS_FILE][cluster.name]
+    data = {"type": "node", **(cluster.discovery or Discovery()).entry}
+    data |= {"id": "{n}", "cluster": cluster.name}
+    return EntryPattern("{n}", "id", Node, data, file, (f"{place}.discovery.entry",))
+
+
+def _of_one_kind(nodes: Mapping[str, Node], listed: Iterable[Node]) -> Iterator[tuple[str, Node]]:
+    # A property has values of one type. A label with an odd value must not make people's files
+    # invalid, so they decide about the type, else most nodes do; other values do not count.
+    kinds = defaultdict[str, Counter[Kind | None]](Counter)
+    for weight, group in ((1, nodes.values()), (len(nodes) + 1, listed)):
+        for node in group:
+            for name, value in node.properties.items():
+                kinds[name][kind_of(value)] += weight
+    common = {name: counts.most_common(1)[0][0] for name, counts in kinds.items()}
+    for id, node in nodes.items():
+        fitting = {n: v for n, v in node.properties.items() if kind_of(v) == common[n]}
+        is_odd = len(fitting) < len(node.properties)
+        yield id, node.model_copy(update={"properties": fitting}) if is_odd else node
+
+
+def in_entry(fault: Fault, reader: ConfigReader, clusters: Mapping[str, Cluster]) -> Fault:
+    """Return a fault of a discovered node at the place where people can mend it."""
+    match = _IN_ENTRY.fullmatch(fault.field) if is_discovered(fault.file) else None
+    name = fault.file.rpartition("/")[2].removesuffix(".yaml")
+    if match is None or name not in clusters:
+        return fault
+    file, place = reader.places[CLUSTERS_FILE][name]
+    return replace(fault, file=file, field=f"{place}.discovery.entry.{match[1]}")
