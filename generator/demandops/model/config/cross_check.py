@@ -226,7 +226,7 @@ def _check_versions(  # noqa: PLR0912 - a branch for each fault
         if appdef.versions != "refuse" and is_unlisted:
             message = (
                 f"is {appdef.versions}, but {config.place_of(configs.VERSIONS_FILE)} does not list "
-                f"the versions of '{name}'; add them there (docs/versions.md), or remove 'versions'"
+                f"the versions of '{name}'; add them there, or remove 'versions'"
             )
             reader.add_fault(f"appdefs/{name}/appdef.yaml", "versions", message)
         own = config.services.get(name, {}) if appdef.versions == "separate" else {}
