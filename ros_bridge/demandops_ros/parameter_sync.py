@@ -99,7 +99,7 @@ class ParameterSetter:
         )
         self._target = str(node.resolve_service_name(target))
         self._on_answer = on_answer
-        self.problem = f"{self._target} has not been asked yet"
+        self.problem = f"{self._target} has not answered yet"
         self._lock = REAL.lock()
         self._wanted: Mapping[str, Any] = {}
         self._version = 0
@@ -120,7 +120,7 @@ class ParameterSetter:
                         f"number between {-_LARGEST - 1} and {_LARGEST}"
                     )
             try:
-                as_the_node_has_it(name, value, 0)
+                as_the_node_has_it(name, value, 0).to_parameter_msg()
             except (TypeError, ValueError) as error:
                 raise type(error)(f"parameter {name}: {error}") from None
         with self._lock:

@@ -48,7 +48,7 @@ from tests.kit.config import state_of
 from tests.kit.goals import EXPERIMENT
 from tests.kit.memory import NOW
 from tests.unit.cluster.cases import Letters
-from tests.unit.demand.test_fuzz import ANYTHING, KEY, TEXT, assert_told, outcome
+from tests.unit.demand.test_refused import ANYTHING, KEY, TEXT, assert_told, outcome
 
 _SEEDS = plain_yaml.beside(__file__, "seeds")
 _BOOKED = sorted(golden.GOLDEN.rglob("expected/*/ledger/**/*.yaml"))

@@ -40,7 +40,7 @@ from tests.kit.memory import MemoryRepo
 from tests.kit.plain_yaml import FAST
 from tests.unit.ledger.test_claim_file import TRICKY, values
 from tests.unit.render.test_inert import TRAPS, UNSEEN
-from tests.unit.repo.test_message_format import IDS
+from tests.unit.repo.test_commit_messages import IDS
 
 _ODD_NAMES = ["../x", "/x", ".git", "a.lock", "-x", "--x=y", "@{", "a~b", "a" * 300]
 _SOME = [*TRAPS, *UNSEEN, *TRICKY, *_ODD_NAMES]

@@ -9,42 +9,27 @@ import jsonschema_rs
 import yaml
 
 from tests.kit.cli import Run
-from tests.kit.repo import git
 
 OPTIONS = "--input camera=a/msg/B --image r/i:1 --service detector=p/d --service tracker=p/t"
 APPLICATION = f"new application tracking {OPTIONS}".split()
 
 
-def test_a_vehicle_more_and_a_parameter_only_reconfigure(
-    checkout: Path, demandops: Run, tmp_path: Path
-) -> None:
-    assert demandops(*APPLICATION, "-C", checkout).code == 0
-    definition = checkout / "appdefs" / "tracking" / "appdef.yaml"
-    text = definition.read_text()
-    definition.write_text(text + "parameters:\n  rate_hz: {default: 10, merge: max}\n")
-    git(checkout, "add", "--all")
-    git(checkout, "commit", "--quiet", "--message=Add tracking")
-    bare = tmp_path / "fleet.git"
-    git(tmp_path, "clone", "--quiet", "--bare", str(checkout), bare.name)
-    demand = checkout / "appdefs" / "tracking" / "demand.yaml"
-    assert demandops("demand", demand, "--state-repo", bare).code == 0
-    changed = yaml.safe_load(demand.read_text())
-    (asked,) = changed["applications"]
-    asked["inputs"]["camera"].append({"topic": "/camera2", "source": "edge"})
-    asked["parameters"] = {"rate_hz": 20}
-    demand.write_text(json.dumps(changed))
-    ran = demandops("demand", "--dry-run", demand, "--state-repo", bare)
-    assert ran.out.count(", reconfigures") == 2 and "restarts" not in ran.out, ran.out
-
-
-def test_an_older_library_is_named_before_anything_is_written(
+def test_an_earlier_library_stays_for_the_charts_that_use_it(
     checkout: Path, demandops: Run
 ) -> None:
-    schema = checkout / "appdefs" / "charts" / "ros-service" / "values.schema.json"
+    library = checkout / "appdefs" / "charts" / "ros-service"
+    schema = library / "values.schema.json"
     schema.write_text(schema.read_text().replace('"reconfigure"', '"former"'))
-    ran = demandops(*APPLICATION, "-C", checkout)
-    assert ran.code != 0 and "appdefs/charts/ros-service is of an earlier version" in ran.err
-    assert not (checkout / "appdefs" / "tracking").exists()
+    before = {path: path.read_text() for path in library.rglob("*") if path.is_file()}
+    assert demandops(*APPLICATION, "-C", checkout).code == 0
+    assert before == {path: path.read_text() for path in library.rglob("*") if path.is_file()}
+    chart = (checkout / "appdefs/tracking/charts/tracking/Chart.yaml").read_text()
+    (used,) = yaml.safe_load(chart)["dependencies"]
+    now = checkout / "appdefs" / "charts" / f"ros-service-{used['version']}"
+    assert used["repository"] == f"file://../../../charts/{now.name}"
+    assert f"\nversion: {used['version']}\n" in (now / "Chart.yaml").read_text()
+    again = [word.replace("tracking", "tracing") for word in APPLICATION]
+    assert demandops(*again, "-C", checkout).code == 0
 
 
 def test_every_file_that_people_write_names_its_schema(demandops: Run, tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
+from demandops.base.naming import SubjectKind
 from demandops.repo.reader import Reader
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
@@ -71,7 +72,12 @@ BUILD = Path(__file__).parents[2] / "build" / "page"
 VIEWS = [
     *("", "map", "map?q=vehicle00", "demands", "services", "connections", "leases", "timeline"),
     *("timeline?at=HEAD~2", f"release?name={FAILING}", "demand?id=vehicle01-to-cloud"),
-    *("overrides", "thing?kind=node&name=edge", "thing?kind=requester&name=vehicle00"),
+    *(
+        "overrides",
+        "demands?gone=1",
+        "thing?kind=node&name=edge",
+        "thing?kind=requester&name=vehicle00",
+    ),
 ]
 SERIOUS = ("serious", "critical")
 
@@ -273,3 +279,39 @@ def test_the_figures_of_the_docs_come_from_here(visit: Visits, tmp_path: Path) -
             FIGURES.mkdir(exist_ok=True)
             shutil.copy(file, FIGURES / file.name)
         assert (FIGURES / file.name).stat().st_size < 200_000
+
+
+LONG = "/vehicles/vehicle01/drivers/the_front_lidar_of_the_roof/pointcloud_without_ground"
+
+
+def test_long_names_scroll_no_page_sideways(visit: Visits, fleet: Story) -> None:
+    reads = {"point_cloud": [{"topic": LONG, "source": "vehicle01"}]}
+    app = {"id": "edge/view", "type": "object-detection-fusion", "node": "edge", "inputs": reads}
+    goal = {"kind": "Demand", "demand": "view", "requesters": ["vehicle01"], "applications": [app]}
+    connection = f"derived/vehicle01/edge{LONG}"
+    try:
+        book(fleet.generator, goal)
+        fleet.wait_followed()
+        assert connection in fleet.follower.newest.state.ledger.subjects(SubjectKind.CONNECTION)
+        seen = visit(width=390)
+        for view in (
+            *VIEWS,
+            "thing?kind=demand&name=view",
+            f"thing?kind=connection&name={connection}",
+        ):
+            page = seen.open(f"/{view}")
+            page.screenshot(path=picture(view, "390"), full_page=True)
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert wide <= 390, f"{view} is {wide} wide"
+            out = page.evaluate(OUT_OF_ITS_CARD)
+            assert out == [], view
+    finally:
+        book(fleet.generator, released("view", "vehicle01"))
+        fleet.wait_followed()
+
+
+# The cards that a text sticks out of.
+OUT_OF_ITS_CARD = """
+() => [...document.querySelectorAll(".panel, .cause, .tile, .figures li")]
+  .filter((card) => card.scrollWidth > card.clientWidth + 1).map((card) => card.textContent)
+"""

@@ -163,7 +163,7 @@ def test_the_example_of_the_scaffold_follows_all_at_once_or_not_at_all(
             client.wait(lambda: is_passed_on("/a", "/b"))
             want([""])
             client.wait(lambda: state.read_text() == "set\n")
-            assert read_by_the_fusion(client) == set()
+            client.wait(lambda: read_by_the_fusion(client) == set())
             assert node.poll() is None
         finally:
             node.kill()

@@ -218,7 +218,8 @@ def statuses(
         if domain not in unread:
             unread[domain] = store.unknown_health(domain)
         if reason := unread[domain]:
-            results.append(ReleaseStatus(reason))
+            since = caches[domain.cluster].unread_since
+            results.append(ReleaseStatus(reason, since=since))
             continue
         reader, there = health_reader(domain), objects[domain.cluster]
         health = reader.health(target, commit, there, history)

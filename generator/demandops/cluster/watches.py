@@ -88,6 +88,7 @@ class ObjectCache:
         self._known: set[ObjectSelector] = set()
         self._errors: dict[ObjectSelector, str] = {}
         self._unread = "some objects have not been read yet"
+        self.unread_since = ""  # when reading began to fail, while it fails
         self._closed = runtime.event()
         self._client: Any = None
 
@@ -236,9 +237,10 @@ class ObjectCache:
         with self._lock:
             is_new = reason and reason not in self._errors.values()
             if reason:
+                self.unread_since = self.unread_since or self._runtime.now().isoformat()
                 self._errors[selector] = reason
-            else:
-                self._errors.pop(selector, None)
+            elif self._errors.pop(selector, None) and not self._errors:
+                self.unread_since = ""
         if is_new:
             log.warning("cluster '%s' cannot be read (%s); retrying", self._name, reason)
         self._on_change()

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
+from demandops.base.errors import Fault
 from demandops.decide.planning.overrides import suspended_claims
 from demandops.model.config.config import IMAGES_FILE
 from demandops.model.config.override import Override
@@ -16,6 +17,7 @@ from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_message import GENERATOR_NAME
+from demandops.repo.load.snapshot import Problem
 from demandops.views.rows import RANKS
 from demandops.views.source import Source, claims_behind, since_of, word_of
 
@@ -93,22 +95,33 @@ def _unread_or_invalid(source: Source) -> Iterator[Cause]:
             "let the generator's account push to main",
             told=source.push_denied,
         )
+    of_commits: dict[str, list[Problem]] = {}
     for problem in source.problems:
+        of_commits.setdefault(problem.since or problem.file, []).append(problem)
+    for problem, *others in of_commits.values():
         change = source.last_change(problem.file)
-        field = f", {problem.field}" if problem.field else ""
-        held = str(source.snapshot.configuration)[:10]
+        files = [*dict.fromkeys(each.file for each in (problem, *others) if each.file)]
+        what = " and ".join([*files[:_MOST_LISTED], *(["others"] if files[_MOST_LISTED:] else [])])
+        field = f", {problem.field}" if problem.field and not others else ""
+        held, are = str(source.snapshot.configuration)[:10], "are" if files[1:] else "is"
         yield Cause(
             "invalid",
-            f"{problem.file or 'The configuration'}{field}",
-            f"is not valid, so the configuration of commit {held} stays in effect",
+            f"{what or 'The configuration'}{field}",
+            f"{are} not valid, so the configuration of commit {held} stays in effect",
             f"{problem.author}, whose commit made it invalid"
             if problem.author
             else "the person who last changed it",
             source.remedy or "correct the file by pull request",
             f"git show {problem.since[:10]}" if problem.since else "demandops check .",
-            told=problem.message,
+            told="\n".join(_told(each) for each in (problem, *others))
+            if others
+            else problem.message,
             since=change.time if change else None,
         )
+
+
+def _told(problem: Problem) -> str:
+    return str(Fault("invalid", problem.field, problem.message, problem.file, problem.line))
 
 
 def _denied(source: Source) -> Iterator[Cause]:

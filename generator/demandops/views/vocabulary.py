@@ -109,7 +109,7 @@ def decision_text(decision: Json) -> str:
 def commit_data(entry: LogEntry) -> Json:
     answer, requesters = entry.answer, entry.trailers.get("Requester", [])
     who = ", ".join(requesters) or entry.author
-    if entry.first("Operation") in ("rollback", "reject"):  # a person did it to what others hold
+    if requesters and entry.by_person:  # a person did it to what others hold
         who = f"{entry.author}, for {who}"
     return {
         "commit": entry.commit,

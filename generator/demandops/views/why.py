@@ -236,6 +236,8 @@ def explain(source: Source, thing: Thing, most: int = 10) -> Json:
         **_EXPLAINED[thing.kind](source, thing),
         **_past(source, reader, thing, most),
     }
+    if thing.kind == "file" and answer["stopped"]:
+        answer["state"] = "gone"
     if answer["state"] == "gone" and answer["proposals"]:
         answer["state"] = "proposed"
     last = answer["stopped"] or answer["started"]
@@ -458,8 +460,9 @@ def _past(source: Source, reader: Reader, thing: Thing, most: int) -> Json:
         ]
         there = {kind for kind, _ in _there(source, thing.name)}
         stopped = about.pop(0) if about and thing.kind not in there else None
-        # else the history was made anew, or it never was on main
-        started = about.pop() if about else None
+        # else the history was made anew, or it never was on main; a rejection starts nothing
+        started = next((each for each in reversed(about) if REJECTS not in each.trailers), None)
+        about = [each for each in about if each is not started]
         more = max(len(about) - most, 0)
         history = PathHistory(started, tuple(about[:most]), more, stopped)
     elif thing.path:

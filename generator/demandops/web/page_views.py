@@ -16,7 +16,7 @@ from starlette.requests import Request
 from demandops.model.config.base_model import parse_time
 from demandops.model.release import ServiceRelease
 from demandops.views import causes as cause_list
-from demandops.views.kinds import KINDS, Kind, rows_of
+from demandops.views.kinds import KINDS, Kind, past_rows, rows_of
 from demandops.views.rows import RANKS, TONES, Filter, Row, exactly, page_of, sorted_rows
 from demandops.views.source import Source
 from demandops.views.vocabulary import Json
@@ -196,7 +196,10 @@ def _overview(asked: ViewRequest) -> tuple[str, Data]:
 
 def _list(asked: ViewRequest) -> tuple[str, Data]:
     kind, now, sort = KINDS[asked.path], asked.source.now, asked.get("sort")
-    every = rows_of(asked.source, asked.path)
+    gone, kept = kind.has_past and bool(asked.get("gone")), asked.source.derived
+    if gone and f"past {kind.name}" not in kept:
+        kept[f"past {kind.name}"] = past_rows(asked.source, kind.name)[0]
+    every = kept[f"past {kind.name}"] if gone else rows_of(asked.source, kind.name)
     matching = [row for row in every if asked.filter.matches(row)]
     columns = {column.key: column for column in kind.columns if not column.only_wide}
     if (key := sort.removeprefix("-")) in columns:  # `-` before a key is the reverse order
@@ -204,6 +207,7 @@ def _list(asked: ViewRequest) -> tuple[str, Data]:
     shown, page, pages = page_of(matching, asked.page(), _ROWS)
     return "list.html.j2", {
         "kind": kind,
+        "gone": gone,
         "table": _table(kind, [row.item for row in shown], now),
         "total": len(every),
         "matching": len(matching),

@@ -129,10 +129,14 @@ def test_an_invalid_file_names_who_wrote_it_and_too_many_causes_are_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     person.change({"registry/images.yaml": "images: [\n", "registry/charts.yaml": "charts: [\n"})
+    person.change({"overrides/wrong.yaml": "kind: nothing\n"})
     booked.fetch_now()
-    wait_until(lambda: booked.snapshot.problems, "the generator reports it")
+    wait_until(lambda: len(booked.snapshot.problems) > 2, "the generator reports it")
     page = look("/")
-    for cause in causes(follower.newest):
+    of_commits = causes(follower.newest)
+    assert len(follower.newest.problems) > len(of_commits) == 2
+    assert "\noverrides/wrong.yaml:1: kind: is 'nothing'" in "".join(c.told for c in of_commits)
+    for cause in of_commits:
         assert cause.kind == "invalid"
         assert cause.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
         assert cause.command.startswith("git show ")
@@ -226,6 +230,17 @@ def _assert_taken_over(follower: Follower, look: Look) -> None:
     assert now.claims_of_releases == anew.claims_of_releases
     for name in LISTS:
         assert sorted(map(str, rows_of(now, name))) == sorted(map(str, rows_of(anew, name)))
+
+
+def test_what_is_gone_has_a_list_of_its_own(booked: Generator, look: Look) -> None:
+    made = goals.put("mine", "vehicle02", applications=[], connections=[LINK])
+    over = {"kind": "Demand", "operation": "release", "demand": "mine", "requesters": ["vehicle02"]}
+    book(booked, made, over)
+    assert "mine" not in look("/demands").text
+    page = look("/demands", gone="1")
+    (row,) = page.texts("tr")[1:]
+    assert re.match(r"mine gone [0-9]+s ago by .*, release in [0-9a-f]{10} vehicle02", row)
+    assert "gone=1" in look("/connections").link("Those that are gone")
 
 
 def test_a_state_repo_that_is_away_is_told_and_followed_again(

@@ -91,6 +91,19 @@ def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:
     assert read.why_unknown([CHILDREN]) == read.why_unknown([OVER])
 
 
+def test_since_when_a_cluster_cannot_be_read_is_known_until_it_can(api: Api) -> None:
+    api.refused = "perception"
+    cache = store(api)
+    cache.watch([DEPLOYMENTS])
+    wait_until(lambda: cache.unread_since, "the first answer has come")
+    target = Target(ClusterDomain("c-its", "d", "perception"), "r", is_service=True)
+    (status,) = rollouts.statuses([target], "a" * 40, {"c-its": cache}, Letters(), lambda *_: None)
+    assert status.since == cache.unread_since
+    api.refused = "nothing"
+    wait_until(lambda: not cache.unread_since, "it is read again")
+    cache.close()
+
+
 def test_a_watch_that_lags_takes_nothing_back(tmp_path: Path) -> None:
     def item(name: str, version: int) -> dict[str, Any]:
         return {"metadata": {"name": name, "resourceVersion": str(version)}}

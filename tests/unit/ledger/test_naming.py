@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from tests.kit.chance import examples, visible
 
 DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
-ROS_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 ROS_NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-LONGEST_NAME, LONGEST_TOPIC = 53, 247
+LONGEST_NAME = 53
 
 Subject = tuple[str, ...]
 """What a name is made from: a prefix, and ids or topics."""
@@ -104,24 +103,3 @@ def test_different_subjects_have_different_names_that_kubernetes_takes(
 def test_each_group_of_requesters_has_a_demand_of_its_own() -> None:
     pairs = [*combinations(["a", "a,b", "b", "a b", '["a"]', "a\\", "\\a", '"'], 2)]
     assert len({demand_id("request", pair) for pair in pairs}) == len(pairs)
-
-
-def as_the_reference(id: str) -> str:
-    """Return an id as the reference writes it in topics (application_manager/utils.py)."""
-    return id.replace("-", "_").replace("/", "_")
-
-
-@examples(50)
-@given(st.lists(st.one_of(st.tuples(ids), st.tuples(ids, topics)), min_size=1, max_size=12))
-def test_derived_topics_are_the_references_or_differ_and_ros_takes_them(
-    drawn: list[Subject],
-) -> None:
-    found = {*drawn, *((naming.topic_part(*subject),) for subject in drawn)}
-    taken = {s for s in found if len(s) == 1 and ROS_NODE.fullmatch(as_the_reference(s[0]))}
-    taken = {(id,) for (id,) in taken if len(id) <= 120 and re.search("[^-/_]", id)}
-    assert all(naming.topic_part(id) == as_the_reference(id) for (id,) in taken)
-    named_apart(found - taken, naming.topic_part)
-    for subject in found:
-        topic = f"/{naming.topic_part(*subject)}_global_trajectories"
-        assert ROS_TOPIC.fullmatch(topic), topic
-        assert len(topic) <= LONGEST_TOPIC

@@ -1,16 +1,26 @@
-"""What an access domain keeps apart: the kinds of its objects, and the credentials of brokers."""
+"""What an access domain keeps apart: kinds of objects, credentials of brokers, nodes of pods.
+
+`tests/e2e` shows what a cluster refuses by the rules for pods. The tests here translate the rule
+for node selectors from CEL to Python and evaluate the result.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from random import Random
 from typing import Any
 
 import pytest
 import yaml
+from demandops.decide.state import rendered_files
+from demandops.model.config.base_model import matches
 from demandops.model.config.load import load
+from demandops.render.gitops import expression_of, node_rule
+from demandops.repo.merge_check.rendered_charts import manifest_faults
 
+from tests.kit import plain_yaml
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.connections import demand, routes
 from tests.kit.memory import MemoryRepo
@@ -27,7 +37,8 @@ REGISTERED = {
     "policy": "PodDisruptionBudget",
     "rbac.authorization.k8s.io": "Role RoleBinding",
 }
-PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
+ROOT = Path(__file__).parents[3]
+PAGE = (ROOT / "docs" / "policy.md").read_text()
 
 
 def domain(**fields: Any) -> dict[str, str]:
@@ -36,16 +47,10 @@ def domain(**fields: Any) -> dict[str, str]:
     return edited(DOMAINS, 'nodes: ["*"]', f'nodes: ["*"]{text}')
 
 
-def bootstrap(files: Mapping[str, str], kind: str) -> dict[str, Any]:
-    documents = yaml.safe_load_all(MemoryRepo(files).files["bootstrap/c-its.yaml"])
-    (found,) = (item for item in documents if item["kind"] == kind)
-    return dict(found)
-
-
 def written(files: Mapping[str, str]) -> dict[str, set[str]]:
     """Return the resources that the domain's account may write, by API group."""
     found: dict[str, set[str]] = {}
-    for rule in bootstrap(files, "Role")["rules"]:
+    for rule in bootstrap(files)["Role"]["rules"]:
         if "create" in rule["verbs"] and "toolkit" not in rule["apiGroups"][0]:
             found.setdefault(rule["apiGroups"][0], set()).update(rule["resources"])
     return found
@@ -54,7 +59,7 @@ def written(files: Mapping[str, str]) -> dict[str, set[str]]:
 def permitted(files: Mapping[str, str]) -> set[tuple[str, str]]:
     """Return the (group, kind) pairs that the domain's AppProject permits."""
     argocd = {"demandops.yaml": skeleton("argocd")["demandops.yaml"]}
-    project = bootstrap(argocd | dict(files), "AppProject")
+    project = bootstrap(argocd | dict(files))["AppProject"]
     return {
         (item["group"], item["kind"])
         for item in project["spec"]["namespaceResourceWhitelist"]
@@ -134,3 +139,140 @@ def test_the_credentials_of_the_documentation_are_taken() -> None:
     found = config.domains["perception"].broker_credentials
     secrets = {node: {"secret": one.secret} for node, one in found.items()}
     assert secrets == given["brokerCredentials"]
+
+
+# ---- the rules of a cluster for the pods of a domain ----
+
+
+NODES = "inventory/nodes.yaml"
+BOOTSTRAP = "bootstrap/c-its.yaml"
+EXAMPLE = ROOT / "examples" / "policy" / "sensors-apart.yaml"
+TEXTS = plain_yaml.beside(__file__, "pods-of-a-domain")
+FILES = {DOMAINS: TEXTS["policy"], "inventory/nodes/own.yaml": TEXTS["nodes"]}
+
+
+def taken(rule: str, selector: Mapping[str, str]) -> bool:
+    """Return whether a rule for node selectors accepts a pod's node selector."""
+    python = rule.replace("&&", "and").replace("||", "or").replace("variables.selector", "selector")
+    python = re.sub(r'(selector\["\w+"\])\.matches\(', r"search(\1, ", python)
+    scope = {
+        "selector": selector,
+        "true": True,
+        "search": lambda text, found: re.search(found, text),
+    }
+    return bool(eval(python, {}, scope))  # noqa: S307 - our own text
+
+
+def test_a_pod_selects_a_node_of_its_domain() -> None:
+    config = load(configuration(FILES))
+    for domain in config.domains.values():
+        rule = node_rule("c-its", domain, config)
+        for node in config.nodes.values():
+            own = config.domain_of[node.id] is domain or node.labels == {"node_id": "own3"}
+            assert taken(rule, node.labels) == own, (domain.name, node.id)
+            assert taken(rule, node.labels | {"more": "narrower"}) == own
+        for selector in ({}, {"node_id": "other"}, {"place": "x"}, {"kubernetes.io/os": "linux"}):
+            assert not taken(rule, selector), selector
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_a_pattern_means_in_a_cluster_what_it_means_in_the_policy(seed: int) -> None:
+    random = Random(seed)
+    for _ in range(50):
+        name = "".join(random.choices("ab.-_[]", k=random.randint(1, 5)))
+        pattern = "".join(random.choice((one, one, "*", "?")) for one in name)
+        other = "".join(random.choices("ab.-_[]", k=len(name)))
+        for text in (name, other):
+            found = bool(re.search(f"^({expression_of(pattern)})$", text))
+            assert found == matches(text, (pattern,)), (pattern, text)
+
+
+def test_a_node_without_labels_to_select_is_any() -> None:
+    config = load(configuration(edited(NODES, "- id: cloud\n", "- id: cloud\n    selector: {}\n")))
+    assert taken(node_rule("c-its", config.domains["perception"], config), {})
+
+
+def bootstrap(files: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    text = rendered_files(MemoryRepo(files).state)[BOOTSTRAP].split("\n---\n", 1)[1]
+    assert not [*manifest_faults({BOOTSTRAP: text})]
+    return {item["kind"]: item for item in yaml.safe_load_all(text)}
+
+
+OWN_LABELS = TEXTS["node"].replace("c-its}", "c-its, selector: {node_id: nine}}")
+NEW_NODE = "inventory/nodes/new.yaml"
+CHARTS, NEW = "registry/charts.yaml", "appdefs/new/charts/new"
+CHART = {
+    CHARTS: f"{skeleton()[CHARTS]}  new: {{folder: {NEW}, version: 1.0.0}}\n",
+    f"{NEW}/Chart.yaml": "apiVersion: v2\nname: new\nversion: 1.0.0\n",
+}
+
+
+@pytest.mark.parametrize(
+    ("gitops", "added", "changed"),
+    [
+        ("flux", {NEW_NODE: TEXTS["node"]}, set()),
+        ("argocd", {NEW_NODE: TEXTS["node"]}, set()),
+        ("flux", {NEW_NODE: OWN_LABELS}, {"c-its.yaml"}),
+        ("flux", CHART, {"new-1.0.0.yaml"}),
+    ],
+    ids=["a vehicle", "a vehicle, by Argo CD", "labels of its own", "a chart in a new folder"],
+)
+def test_only_labels_of_its_own_change_what_someone_applied(
+    gitops: str, added: dict[str, str], changed: set[str]
+) -> None:
+    """Nobody applies the bootstrap file again for a further vehicle or chart."""
+    files = FILES | {"demandops.yaml": skeleton(gitops)["demandops.yaml"]}
+    before = rendered_files(MemoryRepo(files).state)
+    after = rendered_files(MemoryRepo(files | added).state)
+    names = {path.rpartition("/")[2] for path in after if before.get(path) != after[path]}
+    assert names == changed
+
+
+LEVELS = {"baseline": 7, "host-network": 6, "privileged": 1}
+
+
+@pytest.mark.parametrize("gitops", ["flux", "argocd"])
+@pytest.mark.parametrize("level", LEVELS)
+def test_each_level_has_its_label_and_rules(level: str, gitops: str) -> None:
+    policy = edited(DOMAINS, "    podSecurity: host-network", f"    podSecurity: {level}")
+    nodes = skeleton()[NODES].replace("    type:", "    hostNetwork: false\n    type:")
+    files = policy | {NODES: nodes, "demandops.yaml": skeleton(gitops)["demandops.yaml"]}
+    made = bootstrap(files)
+    enforced = "baseline" if level == "baseline" else "privileged"
+    assert made["Namespace"]["metadata"]["labels"] == {
+        "demandops/pod-security": level,
+        "pod-security.kubernetes.io/enforce": enforced,
+    }
+    policy, binding = (made[f"ValidatingAdmissionPolicy{kind}"] for kind in ("", "Binding"))
+    rules = policy["spec"]["validations"]
+    assert len(rules) == LEVELS[level]
+    assert ("hostNetwork is not possible" in str(rules)) == (level == "baseline")
+    used = {name for rule in rules for name in re.findall(r"variables\.(\w+)", rule["expression"])}
+    assert used <= {variable["name"] for variable in policy["spec"]["variables"]}
+    assert binding["spec"]["policyName"] == policy["metadata"]["name"]
+    labels = binding["spec"]["matchResources"]["namespaceSelector"]["matchLabels"]
+    assert labels == {"kubernetes.io/metadata.name": "perception"}
+
+
+def test_the_example_of_the_documentation() -> None:
+    policy = EXAMPLE.read_text()
+    text = rendered_files(MemoryRepo({DOMAINS: policy}).state)[BOOTSTRAP]
+    rules = {
+        item["metadata"]["name"]: item["spec"]["validations"]
+        for item in yaml.safe_load_all(text)
+        if item["kind"] == "ValidatingAdmissionPolicy"
+    }
+    assert {name: len(found) for name, found in rules.items()} == {
+        "demandops-perception": LEVELS["host-network"],
+        "demandops-sensors": LEVELS["privileged"],
+    }
+    assert taken(rules["demandops-sensors"][0]["expression"], {"node_id": "station7"})
+    (refusal,) = re.findall(r"^    Valid.* denied request: (.*)$", PAGE, re.MULTILINE)
+    assert refusal in {rule["message"] for rule in rules["demandops-perception"]}
+
+
+def test_the_default_lets_nodes_have_the_hosts_network() -> None:
+    assert load(configuration()).domains["perception"].pod_security == "host-network"
+    bare = skeleton()[DOMAINS].replace("    podSecurity: host-network\n", "")
+    assert bare != skeleton()[DOMAINS]
+    assert bootstrap({DOMAINS: bare}) == bootstrap({})

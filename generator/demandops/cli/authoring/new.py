@@ -337,6 +337,11 @@ _LIBRARY_FOLDER = f"appdefs/charts/{charts.LIBRARY}"
 _SYNC = "demandops"  # the image with `demandops parameter-sync`
 
 
+def _version_of(files: Mapping[str, str], chart: str) -> str:
+    version = re.search(r"(?m)^version: (\S+)$", files[f"{chart}/Chart.yaml"])
+    return version[1] if version else _VERSION
+
+
 def _application_files(
     name: str,
     description: str,
@@ -348,16 +353,13 @@ def _application_files(
     root = f"appdefs/{name}"
     chart = f"{root}/charts/{name}"
     library, texts = new_repo.files_of_library(_LIBRARY_FOLDER), _templates("application")
-    has_library = f"{_LIBRARY_FOLDER}/Chart.yaml" in config.files
+    folder = _LIBRARY_FOLDER
+    if '"reconfigure"' not in config.files.get(f"{folder}/values.schema.json", '"reconfigure"'):
+        # an earlier version, which cannot change a running node, stays for the charts that use it
+        folder += f"-{_version_of(library, folder)}"
+        library = {folder + path.removeprefix(_LIBRARY_FOLDER): library[path] for path in library}
+    has_library = f"{folder}/Chart.yaml" in config.files
     files, shared = ({}, config.files) if has_library else (library, library)
-    version = re.search(r"(?m)^version: (\S+)$", shared[f"{_LIBRARY_FOLDER}/Chart.yaml"])
-    library_schema = json.loads(shared[f"{_LIBRARY_FOLDER}/values.schema.json"])
-    if "reconfigure" not in library_schema["definitions"][charts.EXPORT]["properties"]:
-        raise StateRepoError(
-            f"{_LIBRARY_FOLDER} is of an earlier version, which cannot change the parameters of a "
-            f"running node; copy {data_folder('appdefs') / 'charts' / charts.LIBRARY} over it, and "
-            "give the charts that use it new versions (nothing was changed)"
-        )
     given = {
         "NAME": name,
         "DESCRIPTION": description,
@@ -369,8 +371,9 @@ def _application_files(
         "SYNC": _SYNC,
         "VERSION": _VERSION,
         "LIBRARY": charts.LIBRARY,
-        "LIBRARY_FOLDER": _LIBRARY_FOLDER,
-        "LIBRARY_VERSION": version[1] if version else _VERSION,
+        "LIBRARY_FOLDER": folder,
+        "LIBRARY_PLACE": folder.removeprefix("appdefs/"),
+        "LIBRARY_VERSION": _version_of(shared, folder),
         "EXPORT": charts.EXPORT,
         "SERVICES": "",
     }
@@ -441,8 +444,8 @@ def _application_files(
         f"Values of the chart {name}",
         {"node": json.loads(texts["node.schema.json"])},
         files[f"{chart}/values.yaml"],
-        library_schema,
-        shared[f"{_LIBRARY_FOLDER}/values.yaml"],
+        json.loads(shared[f"{folder}/values.schema.json"]),
+        shared[f"{folder}/values.yaml"],
     )
     files[f"{chart}/values.schema.json"] = json.dumps(schema, indent=2, ensure_ascii=False) + "\n"
     registered = [

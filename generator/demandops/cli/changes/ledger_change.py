@@ -312,7 +312,7 @@ def rollback(
       demandops rollback 14:00 --dry-run
       demandops rollback 14:00 -m "The station sent nonsense"
       demandops rollback 2h -m "A wrong test" --demand visit
-      demandops rollback --application edge/object_detection_fusion -m "The last change was wrong"
+      demandops rollback --application edge/object_detection_fusion -m "A mistake"
       demandops rollback 2h -m "A wrong test" --drop-newer --yes
     """
     if demand and application:

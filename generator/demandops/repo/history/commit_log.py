@@ -32,6 +32,7 @@ from demandops.repo.history.commit_message import (
     GENERATOR_NAME,
     PROPOSAL,
     REJECTS,
+    REQUESTERS_AT,
     generator_signature,
     parse,
     signature,
@@ -73,6 +74,7 @@ class LogEntry:
     # for a commit of a proposal, because a person may merge it onto other changes. Anybody can
     # commit under the generator's name, so is_by_generator also checks a required signature.
     by_generator: bool = False
+    by_person: bool = True  # whether the author is one, and neither requesters nor the generator
     # by the author's clock; for a demand's commit, the time when the demand was received
     authored: datetime | None = None
     # of a demand that needed approval, and of the commit that rejects a proposal
@@ -102,7 +104,7 @@ def _text(raw: bytes) -> str:
 
 def entry_of(commit: Commit) -> LogEntry:
     text = parse(_text(commit.raw_message))
-    committer = _name_and_email(commit.committer)
+    committer, (author, email) = map(_name_and_email, (commit.committer, commit.author))
     is_ours, is_proposal = committer == (GENERATOR_NAME, GENERATOR_EMAIL), PROPOSAL in text.trailers
     # a person's message has no trailers for programs, unless it keeps those of a merged proposal,
     # or rejects one
@@ -110,11 +112,12 @@ def entry_of(commit: Commit) -> LogEntry:
     return LogEntry(
         commit=str(commit.id),
         time=time_of(commit),
-        author=_name_and_email(commit.author)[0],
+        author=author,
         summary=text.summary,
         trailers=text.trailers if is_told else {},
         why=text.why if is_told else one_line(text.body),
         by_generator=is_ours and not is_proposal and "Render-Version" in text.trailers,
+        by_person=email != GENERATOR_EMAIL and not email.endswith(REQUESTERS_AT),
         authored=_time(commit.author.time),
     )
 

@@ -111,6 +111,7 @@ _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
 _MOST_PROBLEMS = 20
 _MOST_NODES = 50
+REQUESTERS_AT = "@requester.demandops.invalid"  # no person has an address of this domain
 _UNCHANGED = "Desired state: unchanged."
 _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 _CRUD = " .,:;\"'\\"  # Git removes these at both ends of a name, and refuses an empty name
@@ -135,14 +136,14 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
         name, _, email = request.by.removesuffix(">").rpartition(" <")
         return signature(name, email, received) if name else generator_signature(received)
     # A requester may have any name, also that of a person. So the name says that it is a
-    # requester's, and the address is nobody's: no person has one of its domain.
+    # requester's, and the address is nobody's.
     requesters = _requesters(decision)
     who = "requester" if len(requesters) == 1 else "requesters"
     names = one_line(", ".join(requesters), _MAX_AUTHOR - len(f" ({who})"))
     claims = decision.changes.claims
     demand = claims[0].key.demand if claims else request.demand
     local = demand if _LOCAL_PART.fullmatch(demand) else claim_files.segment(demand)
-    return signature(f"{names} ({who})", f"{local}@requester.demandops.invalid", received)
+    return signature(f"{names} ({who})", f"{local}{REQUESTERS_AT}", received)
 
 
 def signed_off(text: str, by: str) -> str:
