@@ -38,6 +38,7 @@ from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
 from demandops.model.ledger.claim import LEDGER_ROOT
 from demandops.repo import reader
+from demandops.repo.history import commit_log
 from demandops.repo.reader import Reader
 from demandops.views.vocabulary import Json, override_data
 
@@ -74,7 +75,9 @@ def ends_at(text: str | None) -> str | None:
         end = (now + timedelta(seconds=seconds_of(text))).replace(microsecond=0)
     except ValueError:
         try:
-            end = parse_time(text)
+            # a time of day is the next one
+            last = commit_log.parse_time(text, now) if ":" in text and "-" not in text else None
+            end = last + timedelta(days=1) if last else parse_time(text)
         except ValueError as error:
             raise ValueError(f"{error}, or a duration like 2h") from None
     if end <= now:
@@ -88,7 +91,7 @@ until_option = click.option(
     "expires",
     metavar="TIME",
     callback=read_by(ends_at),
-    help="When it ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
+    help="When it ends: 2h, 3d, 18:00 (UTC), or a time like 2027-01-31T18:00:00Z.",
 )
 
 # ---- ``demandops override``: create or end an override ----

@@ -398,7 +398,7 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
             known = "refused" if row["outcome"] == "refused" else "has no known outcome"
             errors.print(f"{title} {known}")
             by_text: dict[str, list[Fault]] = {}  # one reason may refuse several parts of a demand
-            for each in row["faults"]:
+            for each in sorted(row["faults"], key=lambda fault: fault["line"] or 0):
                 by_text.setdefault(each["message"], []).append(Fault(**each))
             for first, *others in by_text.values():
                 places = f"; so are {', '.join(each.field for each in others)}" if others else ""

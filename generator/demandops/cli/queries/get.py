@@ -262,6 +262,10 @@ def _refuse_unknown(
         labels |= {column.key.removesuffix("s") for column in kind.columns} | {*FILTERS, kind.word}
     asked = [(name, kind.word, "", {row.item["name"] for row in rows}) for name in names]
     for label, pattern, option in wanted:
+        if label == "health" and rows and label not in labels:
+            raise click.UsageError(
+                f"{option}: the health is that of clusters: give --clusters FILE"
+            )
         if label not in labels:
             raise click.UsageError(
                 f"{option}: {kind.name}{' that are gone' if gone else ''} have no {label}; they "
