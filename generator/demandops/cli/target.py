@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import shlex
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial, reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -323,6 +324,14 @@ def name_options(helps: dict[str, str], **more: Any) -> Callable[[Command], Comm
             for name, text in helps.items()
         )
     )
+
+
+def options_for(repo: Reader, name: str, kinds: Iterable[str]) -> str:
+    """Return a hint for a name that was given without the option that says what it is."""
+    meant = [
+        f"--{kind} {shlex.quote(name)}" for kind in kinds if name in all_names(repo, f"{kind}s")
+    ]
+    return f"; did you mean: {' or '.join(meant)}" if meant else ""
 
 
 def all_names(repo: Reader, kind: str) -> Iterator[str]:
