@@ -70,7 +70,7 @@ def test_a_scaffolded_application_follows_50_changes_without_a_restart(world: Wo
         return (*domain.identity(name), *counts)
 
     domain.wait("the first input", lambda: inputs() == ["/station00/wave"])
-    domain.wait("its pod", lambda: (name, "edge") in domain.pods())
+    domain.wait("its pod", lambda: ("ear-edge-ears", "edge") in domain.pods())
     before = lives()
     for turn in range(ROUNDS):
         goals = []
