@@ -1,8 +1,9 @@
-"""Measure the event detector: the engine alone, then the node with messages over ROS 2.
+"""Measure the event detector: the rules alone, then the node with messages over ROS 2.
 
-The engine gets 2,000 entities at 10 Hz, with 100 areas, a rule on pairs and a rule on a count. The
-node gets poses of more and more entities at 10 Hz until it loses messages. First each entity has a
-topic of its own, then all entities share one topic.
+The rules get poses of 5,000 entities at 10 Hz, with 100 areas, a rule on pairs and one on a count.
+The node gets poses of more and more entities at 10 Hz until it loses messages. First each entity
+has a topic of its own, then all entities share one topic. What it uses is compared with what a node
+uses that takes the same messages in the same way, and does nothing with them.
 """
 
 from __future__ import annotations
@@ -14,15 +15,17 @@ import subprocess
 import sys
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from demandops.detect import rule_file
-from demandops.detect.event_engine import EventEngine, Observation
+from demandops.detect.event_engine import EventEngine
+from demandops.detect.message_reader import MessageReader
 
 from tests.kit.detection import POSE, rule, text_of
 
-ENTITIES, HZ, SECONDS, WIDTH_M = 2000, 10, 10, 10_000
+ENTITIES, HZ, SECONDS, WIDTH_M = 5000, 10, 4, 10_000
 ROS_SECONDS = 6
 OWN_TOPIC = {"cars": {"topic": "/cars/{entity}/pose", "type": POSE, "timeout": "5s"}}
 ONE_TOPIC = {
@@ -50,34 +53,75 @@ def rules() -> list[dict[str, Any]]:
     return [*areas, pair, rule("count", count=count)]
 
 
-def engine() -> None:
-    """Measure the engine with 2,000 entities that drive at 50 km/h; print the result."""
-    run = EventEngine(rule_file.read(text_of(*rules()), "rules.yaml"))
+def without_ros() -> None:
+    """Measure deserializing, reading and the rules, for entities that drive at 50 km/h."""
+    from geometry_msgs.msg import PoseStamped
+    from rclpy.serialization import deserialize_message, serialize_message
+
+    file = rule_file.read(text_of(*rules()), "rules.yaml")
+    engine, reader = EventEngine(file), MessageReader(file, "cars")
     chance = random.Random(1)
     cars = [
         (chance.uniform(0, WIDTH_M), chance.uniform(0, WIDTH_M), chance.uniform(0, 6.28))
         for _ in range(ENTITIES)
     ]
-    state, events, spent = run.start(0.0), 0, 0.0
+    state, events, spent = (
+        engine.start(0.0),
+        0,
+        {"deserializing": 0.0, "reading": 0.0, "rules": 0.0},
+    )
+    message = PoseStamped()
     for step in range(1, SECONDS * HZ + 1):
         now, away = step / HZ, step * 13.9 / HZ
-        seen = [
-            Observation("cars", f"car{n}", now, (x + away * math.cos(h), y + away * math.sin(h)))
-            for n, (x, y, h) in enumerate(cars)
-        ]
-        began = time.process_time()
-        state, told = run.step(state, seen, now)
-        spent += time.process_time() - began
+        sent = []
+        for x, y, heading in cars:
+            message.pose.position.x = x + away * math.cos(heading)
+            message.pose.position.y = y + away * math.sin(heading)
+            sent.append(serialize_message(message))
+        times = [time.process_time()]
+        heard = [deserialize_message(data, PoseStamped) for data in sent]
+        times.append(time.process_time())
+        seen = [reader.observation(each, f"car{n}", now) for n, each in enumerate(heard)]
+        times.append(time.process_time())
+        state, told = engine.step(state, filter(None, seen), now)
+        times.append(time.process_time())
+        for name, (began, ended) in zip(spent, pairwise(times), strict=True):
+            spent[name] += ended - began
         events += len(told)
-    share, each = spent / SECONDS, spent / (SECONDS * HZ)
+    each = {name: f"{used / SECONDS / HZ / ENTITIES * 1e6:.1f} us" for name, used in spent.items()}
+    own, share = spent["reading"] + spent["rules"], 1 / SECONDS
     print(
-        f"engine: {ENTITIES} entities at {HZ} Hz, 102 rules: {each * 1000:.1f} ms for each "
-        f"step of {1000 / HZ:.0f} ms, {share:.0%} of a core; {events} events"
+        f"rules: {ENTITIES} entities at {HZ} Hz, 102 rules: for a message {each}; reading and "
+        f"rules take {own * share:.0%} of a core, {1 + own / spent['deserializing']:.2f} times as "
+        f"much with deserializing as deserializing alone; {events} events"
     )
 
 
-def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
-    """Return how many poses were sent over ROS and read, and the detector's share of a core."""
+def alone(*topics: str) -> None:
+    """Take the messages of topics as the detector does, until a signal; print how many."""
+    import rclpy
+    from demandops_ros import ros_process
+    from demandops_ros.detector.detector_node import SourceSubscriptions, _taken
+
+    with ros_process.StopSignals() as signals, ros_process.started([]):
+        node, taken = rclpy.create_node("alone"), 0
+        file = rule_file.read(text_of(*rules()), "rules.yaml")
+        subscribing = SourceSubscriptions(node, file, lambda: 0.0)
+        subscriptions = [subscribing._subscribe(POSE, topic) for topic in topics]
+
+        def take() -> None:
+            nonlocal taken
+            taken += sum(1 for each in subscriptions for _ in _taken(each))
+
+        node.create_timer(0.1, take)
+        thread = ros_process.ExecutorThread(node)
+        signals.wait()
+        thread.close()
+        print(taken)
+
+
+def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, int, float]:
+    """Return how many poses were sent over ROS and read, and the processor's seconds for it."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import PoseStamped
@@ -87,8 +131,15 @@ def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
         path = Path(folder, "rules.yaml")
         path.write_text(text_of(*rules(), sources=sources))
         options = ["-p", "bookkeeping_topic:=''", "-p", f"rules:={path}"]
-        command = [sys.executable, "-m", "demandops.cli.main", "detect", "--ros-args", *options]
-        detecting = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        own = "{entity}" in sources["cars"]["topic"]
+        names = [f"car{number}" for number in range(entities)]
+        topics = [f"/cars/{name}/pose" for name in names] if own else ["/poses"]
+        command = ["demandops.cli.main", "detect", "--ros-args", *options]
+        if alone:
+            command = ["tests.benchmarks.detector", *topics]
+        detecting = subprocess.Popen(
+            [sys.executable, "-m", *command], stderr=subprocess.DEVNULL, stdout=subprocess.PIPE
+        )
         rclpy.init()
         node = rclpy.create_node("fleet")
 
@@ -98,12 +149,9 @@ def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
                     heard.update((one.key, int(one.value)) for one in status.values)
 
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
-        own = "{entity}" in sources["cars"]["topic"]
-        names = [f"car{number}" for number in range(entities)]
-        topics = [f"/cars/{name}/pose" for name in names] if own else ["/poses"]
         publishers = [node.create_publisher(PoseStamped, topic, 1000) for topic in topics]
         message = PoseStamped()
-        while heard.get("topics", 0) < len(topics) or not all(
+        while (not alone and heard.get("topics", 0) < len(topics)) or not all(
             publisher.get_subscription_count() for publisher in publishers
         ):
             rclpy.spin_once(node, timeout_sec=0.1)
@@ -112,20 +160,20 @@ def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
         for tick in range(ROS_SECONDS * HZ):
             for number, name in enumerate(names):
                 message.header.frame_id = name
-                message.pose.position.x, message.pose.position.y = number * 7.0, tick * 1.4
+                message.pose.position.x, message.pose.position.y = number * 50.0, tick * 1.4
                 publishers[number % len(publishers)].publish(message)
                 sent += 1
             rclpy.spin_once(node, timeout_sec=0)
             time.sleep(max(0.0, began + (tick + 1) / HZ - time.monotonic()))
-        took = time.monotonic() - began
-        share = (cpu(detecting.pid) - used) / took
-        for _ in range(40):
+        spent = cpu(detecting.pid) - used
+        end = time.monotonic() + 4
+        while time.monotonic() < end:
             rclpy.spin_once(node, timeout_sec=0.1)
         node.destroy_node()
         rclpy.shutdown()
         detecting.terminate()
-        detecting.wait(20)
-    return sent, heard["messages"] - before, share
+        printed, _ = detecting.communicate(timeout=20)
+    return sent, int(printed) if alone else heard["messages"] - before, spent
 
 
 def cpu(pid: int) -> float:
@@ -134,13 +182,16 @@ def cpu(pid: int) -> float:
 
 
 def main() -> None:
-    engine()
+    without_ros()
     for what, sources in (("a topic for each", OWN_TOPIC), ("one topic for all", ONE_TOPIC)):
-        for entities in (10, 25, 50, 100, 200, 400, 800):
-            sent, read, share = over_ros(entities, sources)
+        for entities in (50, 100, 200, 400, 800, 1600):
+            sent, read, spent = over_ros(entities, sources, alone=False)
+            _, taken, spent_alone = over_ros(entities, sources, alone=True)
+            each, each_alone = spent / read * 1e6, spent_alone / taken * 1e6
             print(
                 f"node, {what}: {entities} entities at {HZ} Hz: {read / sent:.1%} of {sent} "
-                f"messages read, {share:.0%} of a core",
+                f"messages read, {spent / ROS_SECONDS:.0%} of a core; {each:.0f} us for a message, "
+                f"{each / each_alone:.2f} times as much as to take it alone",
                 flush=True,
             )
             if read < 0.99 * sent:
@@ -149,4 +200,4 @@ def main() -> None:
 
 if __name__ == "__main__":
     os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
-    main()
+    alone(*sys.argv[1:]) if sys.argv[1:] else main()

@@ -22,7 +22,7 @@ OPTIONS = (
 def scaffold(world: World) -> dict[str, str]:
     """Return the files of a new application, as a person gets them in a clone."""
     clone = world.folder / "author"
-    git(world.folder, "clone", "--quiet", world.push_url, str(clone))
+    git(world.folder, "clone", "--quiet", world.url, str(clone))
     demandops(world.folder, "new", "application", "listening", *OPTIONS, "-C", str(clone))
     new = git(clone, "ls-files", "--others").splitlines()
     files = {path: (clone / path).read_text() for path in new}
@@ -70,7 +70,7 @@ def test_a_scaffolded_application_follows_50_changes_without_a_restart(world: Wo
         return (*domain.identity(name), *counts)
 
     domain.wait("the first input", lambda: inputs() == ["/station00/wave"])
-    domain.wait("its pod", lambda: (name, "edge") in domain.pods())
+    domain.wait("its pod", lambda: ("ear-edge-ears", "edge") in domain.pods())
     before = lives()
     for turn in range(ROUNDS):
         goals = []

@@ -107,11 +107,3 @@ class TestYamlAttacks:
         assert {id: entry["requesters"] for id, entry in connections.items()} == {
             text: [text] for text in (*texts, "2026-02-01")
         }
-
-    def test_no_control_character_of_a_file_reaches_the_terminal(
-        self, on: On, tmp_path: Path
-    ) -> None:
-        file = tmp_path / "request.yaml"
-        file.write_text('"\\e[31mred\\a": 1\nid: "\\e]0;title\\a"\napps: [{"\\b\\b": 1}]\n')
-        errors = on.refused("request", file)
-        assert errors.replace("\n", "").isprintable(), repr(errors)

@@ -9,32 +9,9 @@ import jsonschema_rs
 import yaml
 
 from tests.kit.cli import Run
-from tests.kit.repo import git
 
 OPTIONS = "--input camera=a/msg/B --image r/i:1 --service detector=p/d --service tracker=p/t"
 APPLICATION = f"new application tracking {OPTIONS}".split()
-
-
-def test_a_vehicle_more_and_a_parameter_only_reconfigure(
-    checkout: Path, demandops: Run, tmp_path: Path
-) -> None:
-    assert demandops(*APPLICATION, "-C", checkout).code == 0
-    definition = checkout / "appdefs" / "tracking" / "appdef.yaml"
-    text = definition.read_text()
-    definition.write_text(text + "parameters:\n  rate_hz: {default: 10, merge: max}\n")
-    git(checkout, "add", "--all")
-    git(checkout, "commit", "--quiet", "--message=Add tracking")
-    bare = tmp_path / "fleet.git"
-    git(tmp_path, "clone", "--quiet", "--bare", str(checkout), bare.name)
-    demand = checkout / "appdefs" / "tracking" / "demand.yaml"
-    assert demandops("demand", demand, "--state-repo", bare).code == 0
-    changed = yaml.safe_load(demand.read_text())
-    (asked,) = changed["applications"]
-    asked["inputs"]["camera"].append({"topic": "/camera2", "source": "edge"})
-    asked["parameters"] = {"rate_hz": 20}
-    demand.write_text(json.dumps(changed))
-    ran = demandops("demand", "--dry-run", demand, "--state-repo", bare)
-    assert ran.out.count(", reconfigures") == 2 and "restarts" not in ran.out, ran.out
 
 
 def test_an_earlier_library_stays_for_the_charts_that_use_it(

@@ -99,49 +99,6 @@ def test_what_is_more_than_demands_is_listed_and_no_name_of_a_file_adds_lines(
     assert not [line for line in listed if line.startswith(("+ service harmless", "+ nothing"))]
 
 
-def test_a_binary_file_that_approve_would_change_is_told(
-    on: On, person: Person, branch: str
-) -> None:
-    person.fetch()
-    git(person.folder, "checkout", "--quiet", "-B", "work", f"origin/{branch}")
-    person.folder.joinpath("sketch").write_bytes(b"\xff\xd8")
-    git(person.folder, "add", "sketch")
-    git(person.folder, "commit", "--quiet", "--message", "Add a sketch")
-    git(person.folder, "push", "--quiet", "origin", f"HEAD:{branch}")
-    told = on.refused("approve", branch, "--commit", git(person.folder, "rev-parse", "HEAD"))
-    assert f"error: sketch in {branch} is not a plain text file; " in told
-
-
-def test_a_demand_named_like_the_branch_of_another_is_not_taken_for_it(
-    on: On, strict: GitRepo, branch: str
-) -> None:
-    head = at(strict, branch)
-    on.book(put(branch, topic=("/other", "vehicle00")))
-    ran = on("approve", branch, "--commit", head)
-    assert ran.code == 0, ran.err
-
-
-@pytest.mark.parametrize("command", ["approve", "reject"])
-def test_a_proposal_that_has_changed_since_it_was_seen_is_left_alone(
-    on: On, strict: GitRepo, branch: str, command: str
-) -> None:
-    seen = at(strict, branch)
-    on.book(OTHER)
-    (branch,) = branches(strict.path)
-    now = at(strict, branch)
-    assert now != seen
-    told = on.refused(command, "visit", "--commit", seen, "-m", "Why")
-    assert f"is at commit {now}, not at '{seen}'; if it has changed since" in told
-    for other in (now[:39], now.upper(), "HEAD", f"{now[:12]}~0", f"{now}0"):
-        on.refused(command, "visit", "--commit", other, "-m", "Why")
-    assert "give the whole id" in on.refused(command, "visit", "--commit", now[:10], "-m", "Why")
-    assert at(strict, branch) == now
-    ran = on(command, "visit", "--commit", now, "-m", "Why")
-    assert ran.code == 0, ran.err
-    assert command == "reject" or at(strict, "main^2") == now
-    assert "changed: it replaces demand/visit-" in ran.err and seen in ran.err
-
-
 def test_at_a_terminal_the_consequence_is_shown_and_just_that_is_merged(
     strict: GitRepo, branch: str
 ) -> None:

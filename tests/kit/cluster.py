@@ -29,7 +29,7 @@ class KubeApi:
         """How often objects were listed; what changes later is watched."""
         self._changed = threading.Condition()
         self._items: dict[tuple[str, str, str], Item] = {}
-        self._log: list[tuple[str, str, Item]] = []
+        self._log: list[tuple[str, str, Item, str]] = []
 
     def put(self, plural: str, namespace: str, name: str, status: Item, **more: Any) -> None:
         with self._changed:
@@ -38,7 +38,14 @@ class KubeApi:
             metadata["resourceVersion"] = str(len(self._log) + 1)
             item = {"metadata": metadata, "status": status, **more}
             self._items[plural, namespace, name] = item
-            self._log.append((plural, namespace, item))
+            self._log.append((plural, namespace, item, "MODIFIED"))
+            self._changed.notify_all()
+
+    def delete(self, plural: str, namespace: str, name: str) -> None:
+        with self._changed:
+            item = self._items.pop((plural, namespace, name))
+            metadata = item["metadata"] | {"resourceVersion": str(len(self._log) + 1)}
+            self._log.append((plural, namespace, item | {"metadata": metadata}, "DELETED"))
             self._changed.notify_all()
 
     def patch(self, path: str, body: Item) -> None:
@@ -81,9 +88,9 @@ class KubeApi:
                 if len(self._log) == since:
                     self._changed.wait(_BEAT_S)
                 new, since = self._log[since:], len(self._log)
-            for where, there, item in new:
+            for where, there, item, change in new:
                 if (where, there) == (plural, namespace):
-                    yield {"type": "MODIFIED", "object": item}
+                    yield {"type": change, "object": item}
 
     def flux(self, namespace: str, domain: str, commit: str) -> None:
         revision = f"main@sha1:{commit}"

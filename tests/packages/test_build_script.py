@@ -132,28 +132,7 @@ def test_folders_of_messages_are_built_after_what_they_need_and_kept(
         assert calls(script) == ["configure", *MADE] * made
 
 
-REFUSED = {
-    "empty": ({}, "given: has no file msg/*.msg; name the folder of an interface package"),
-    "a name": ({"Fleet;msgs/msg/A.msg": ""}, "'Fleet;msgs' is no name of a package"),
-    "a message": ({"a_msgs/msg/a b.msg": ""}, "a b.msg: is no name of a message; write it like"),
-    "a wheel's": (
-        {"ros_msgs/package.xml": "<name> rclpy </name>", "ros_msgs/msg/A.msg": ""},
-        "ros_msgs: rclpy is installed already",
-    ),
-    "ours": ({f"{OURS}/msg/A.msg": ""}, f"{OURS} is installed already; leave it out"),
-    "twice": ({"x/a_msgs/msg/A.msg": "", "y/a_msgs/msg/A.msg": ""}, "is named a_msgs, like"),
-    "unknown": (
-        {"a_msgs/msg/A.msg": "# b_msgs/B b\nc_msgs/C c\n"},
-        "a_msgs: needs c_msgs, which is not installed; give its folder too",
-    ),
-    "circle": (
-        {"a_msgs/msg/A.msg": "b_msgs/B b", "b_msgs/msg/B.msg": "a_msgs/A a"},
-        "a_msgs and b_msgs: need each other's messages",
-    ),
-}
-
-
-@pytest.mark.parametrize(("files", "told"), REFUSED.values(), ids=REFUSED)
+@pytest.mark.parametrize(("files", "told"), TOOLS["refused"].values(), ids=TOOLS["refused"])
 def test_a_folder_that_cannot_be_built_is_refused_before_anything_is_built(
     files: dict[str, str],
     told: str,

@@ -41,7 +41,7 @@ from demandops.views.vocabulary import Json
 @click.option(
     "--bare",
     is_flag=True,
-    help="Create a bare repository, for `serve` and `request` on this machine. Without this "
+    help="Create a bare repository, for `serve` and `demand` on this machine. Without this "
     "option, the files are checked out in DIR, so that you can push them to a Git server.",
 )
 @click.option(

@@ -19,6 +19,8 @@ log = logging.getLogger("demandops")
 
 # How many nodes one answer has; each lists its images, so that all together may be large
 _PAGE = 500
+# The status of a watch from a version that the API server no longer has
+_GONE = 410
 
 
 class ClusterNodes:
@@ -147,6 +149,8 @@ class _NodeWatch:
 
     def _tell(self, error: Exception) -> None:
         self._version, self._api = "", None  # the kubeconfig may have a new token
+        if getattr(error, "status", None) == _GONE:  # nothing changed for long: list anew
+            return
         if (reason := one_line(reason_of(error))) != self._told:
             self._told = reason
             message = "the nodes of cluster '%s' cannot be read (%s) and stay as they are; retrying"

@@ -19,12 +19,11 @@ from pydantic import TypeAdapter, ValidationError
 from demandops.base.quantities import amount_of
 from demandops.base.quoting import quoted
 from demandops.model.config.base_model import Word, seconds_of, time_text
-from demandops.model.config.discovered import DiscoveredNode, path_of, read, text_of
+from demandops.model.config.discovered import DiscoveredId, DiscoveredNode, path_of, read, text_of
 from demandops.model.config.inventory import (
     NODE_LABEL,
     Cluster,
     Discovery,
-    NodeId,
     PropertyName,
     PropertyValue,
     Quantity,
@@ -35,7 +34,7 @@ from demandops.model.config.inventory import (
 _CAPABILITY, _PROPERTY = "capability.demandops/", "property.demandops/"
 # Kubernetes counts pods like a resource, but no service requests them
 _UNREQUESTED = "pods"
-_ID, _WORD = TypeAdapter[str](NodeId), TypeAdapter[str](Word)
+_ID, _WORD = TypeAdapter[str](DiscoveredId), TypeAdapter[str](Word)
 _NAME, _VALUE = TypeAdapter[str](PropertyName), TypeAdapter[object](PropertyValue)
 _RESOURCE, _AMOUNT = TypeAdapter[str](ResourceName), TypeAdapter[str](Quantity)
 _INTEGER, _DECIMAL = re.compile(r"-?[0-9]{1,15}"), re.compile(r"-?[0-9]{1,15}\.[0-9]{1,9}")

@@ -158,11 +158,11 @@ class Pairs:
         entity: str,
         before: Observation | None,
         after: Observation | None,
-    ) -> None:
+    ) -> Cell | None:
         # An entity without an observation or without a position is in no square.
         left, entered = self._cell(before), self._cell(after)
         if left == entered:
-            return
+            return entered
         around_left, around_entered = {*_nine(left)}, {*_nine(entered)}
         for cell in around_left - around_entered:
             cells[cell] -= {entity}
@@ -170,10 +170,13 @@ class Pairs:
                 del cells[cell]
         for cell in around_entered - around_left:
             cells[cell] = cells.get(cell, frozenset()) | {entity}
+        return entered
 
-    def around(self, cells: Mapping[Cell, frozenset[str]], seen: Observation) -> list[Who]:
+    def around(
+        self, cells: Mapping[Cell, frozenset[str]], cell: Cell | None, seen: Observation
+    ) -> list[Who]:
         """Return all entities that are near enough, and some that are too far away, in order."""
-        if (cell := self._cell(seen)) is None:
+        if cell is None:
             return []
         source = self._second if seen.source == self._first else self._first
         if source != seen.source:
@@ -412,13 +415,15 @@ class EventEngine:
                 self._count(name, 1 if name in counted else -1)
         for pairs in self.pairs[source]:
             if pairs.rule.takes(who):
-                pairs.move(state.cells, entity, before, observation)
-                self._compare_with_others(pairs, observation)
+                cell = pairs.move(state.cells, entity, before, observation)
+                self._compare_with_others(pairs, cell, observation)
 
-    def _compare_with_others(self, pairs: Pairs, observation: Observation) -> None:
+    def _compare_with_others(
+        self, pairs: Pairs, cell: Cell | None, observation: Observation
+    ) -> None:
         who, compared = observation.who, set[Key]()
         rule, limits, state = pairs.rule, pairs.condition, self._state
-        for other in pairs.around(state.cells, observation):
+        for other in pairs.around(state.cells, cell, observation):
             key, away = pairs.key(who, other), distance(observation, state.seen[other])
             compared.add(key)
             self._latch(key, rule, away <= limits.start, away > limits.stop)

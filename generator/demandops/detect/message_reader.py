@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from math import hypot, inf, isfinite
+from operator import attrgetter
 from typing import Any, NamedTuple, TypeAlias
 
 from demandops.base.placeholders import VALUE
@@ -158,7 +159,7 @@ class MessageReader:
                 raise Unreadable(f"{entity[:60]!r} is not a name of an entity")
         position = None
         if self._position and self._place:
-            x, y = (_number(get(message)) for get in self._position)
+            x, y = _number(self._position[0](message)), _number(self._position[1](message))
             if self._map and self._place.in_degrees:
                 x, y = self._metres(x * self._place.scale, y * self._place.scale)
             elif self._frames and self._frame:
@@ -194,13 +195,18 @@ def _number(value: object) -> float:
 def _getter(path: str) -> Getter:
     parts = [(name, int(index or 0)) for name, index in _PART.findall(path)]
 
-    def get(message: Any) -> Any:  # noqa: ANN401
+    def indexed(message: Any) -> Any:  # noqa: ANN401
         value = message
+        for name, index in parts:
+            value = getattr(value, name) if name else value[index]
+        return value
+
+    fetch = indexed if "[" in path else attrgetter(path)  # which is faster
+
+    def get(message: Any) -> Any:  # noqa: ANN401
         try:
-            for name, index in parts:
-                value = getattr(value, name) if name else value[index]
+            return fetch(message)
         except (AttributeError, IndexError, TypeError):
             raise Unreadable(f"the message has no field {path}") from None
-        return value
 
     return get

@@ -132,6 +132,9 @@ class SourceSubscriptions:
             topic: self._subscribe(TF_TYPE, topic, _STATIC_QOS if is_static else _QOS)
             for topic, is_static in (TF_TOPICS if self._frames else {}).items()
         }
+        # the keys of subscriptions that had messages since the last refresh, or before that one
+        self._heard: set[tuple[str, str]] = set()
+        self._heard_before: set[tuple[str, str]] = set()
         self._told: set[str] = set()
         self.messages = self.unreadable = 0
 
@@ -144,8 +147,9 @@ class SourceSubscriptions:
         published: Mapping[str, list[str]] = dict(self._node.get_topic_names_and_types())
         for name, source in self._file.sources.items():
             for topic, types in published.items():
-                entity = entity_in(source.topic, topic)
-                if entity is None or (name, topic) in self.subscriptions:
+                if (name, topic) in self.subscriptions:
+                    continue
+                if (entity := entity_in(source.topic, topic)) is None:
                     continue
                 if source.type not in types:
                     self._tell_once(
@@ -154,7 +158,10 @@ class SourceSubscriptions:
                     )
                 elif self._node.count_publishers(topic):
                     self.subscriptions[name, topic] = self._subscribe(source.type, topic), entity
-        for key in [*self.subscriptions]:
+        # Who was heard lately publishes. Silent for one turn alone, it may have left a message.
+        silent = self.subscriptions.keys() - self._heard - self._heard_before
+        self._heard, self._heard_before = set(), self._heard
+        for key in silent:
             if not self._node.count_publishers(key[1]):
                 self._node.destroy_subscription(self.subscriptions.pop(key)[0])
 
@@ -170,7 +177,10 @@ class SourceSubscriptions:
         for topic, subscription in self._of_frames.items():
             came += ((at, "", topic, "", each) for at, each in _taken(subscription))
         for (source, topic), (subscription, entity) in self.subscriptions.items():
+            before = len(came)
             came += ((at, source, topic, entity, each) for at, each in _taken(subscription))
+            if len(came) > before:
+                self._heard.add((source, topic))
         observations = []
         for received, source, topic, entity, message in sorted(came, key=itemgetter(0)):
             at = now if is_simulated or not received else received / 1e9
@@ -183,10 +193,11 @@ class SourceSubscriptions:
                     observations.append(heard)
             except Unreadable as error:
                 self.unreadable += 1
-                what = (
-                    "" if isinstance(error, NoTransform) else f"a message on {topic} is left out: "
+                # many topics may lack the same frame
+                of_topic = not isinstance(error, NoTransform)
+                self._tell_once(
+                    f"a message on {topic} is left out: {error}" if of_topic else str(error)
                 )
-                self._tell_once(f"{what}{error}")
         return observations
 
     def _tell_once(self, text: str) -> None:
@@ -301,6 +312,8 @@ class DemandSender:
 # not end these demands.
 
 _MOST_REFUSALS = 20  # that the diagnostics list
+# How long messages may wait in their queues
+_TAKE_S = 0.1
 # How many observations are kept until the detector has started
 _MOST_OBSERVATIONS = 100_000
 # The time that ROS reports until the first message of a simulated clock arrives.
@@ -360,6 +373,8 @@ class DetectorNode(Node):  # type: ignore[misc]
             10.0, self._say_what_is_missing, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self.create_timer(settings["period"], self._step)
+        if settings["period"] > _TAKE_S:
+            self.create_timer(_TAKE_S, self._take)
         # a reload replaces the subscriptions, so this timer is not bound to those of now
         self.create_timer(0.5, lambda: self._topics.refresh())  # noqa: PLW0108
         self.create_timer(1.0, self._reload_if_changed)
@@ -395,10 +410,14 @@ class DetectorNode(Node):  # type: ignore[misc]
 
     # ---- periodic work ----
 
-    def _step(self) -> None:
-        taken, now = self._topics.take(), self._now()
-        if now != _UNHEARD_CLOCK:
+    def _take(self) -> None:
+        taken = self._topics.take()
+        if self._now() != _UNHEARD_CLOCK:
             self._observations = (self._observations + taken)[-_MOST_OBSERVATIONS:]
+
+    def _step(self) -> None:
+        self._take()
+        now = self._now()
         if not self._is_started:
             if self._bookkeeping is None or now == _UNHEARD_CLOCK:
                 return

@@ -15,18 +15,14 @@ import pytest
 import yaml
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, StateRepoError
 from demandops.base.settings import GENERATED_ROOTS
-from demandops.model.ledger import claim
-from demandops.repo import reader
 from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot as snapshots
 from demandops.serve.generator import Generator
-from pygit2 import Oid
 
 from tests.kit import plain_yaml, rig
 from tests.kit.chance import IN_FULL
 from tests.kit.config import override
-from tests.kit.memory import NOW
-from tests.kit.repo import FORGER, GitRepo, differing
+from tests.kit.repo import GitRepo, differing
 from tests.kit.repo import read as text
 from tests.kit.rig import Person, goal, leave
 
@@ -264,59 +260,6 @@ def test_no_file_that_a_person_writes_stops_the_demands(
     assert [one for one in outcomes if one in ("join", "shutdown")] == [
         *("join", "join", "shutdown", "join")
     ]
-
-
-@pytest.mark.parametrize("configuration", ["1" * 40, "abc", "HEAD", "main", "side"])
-def test_a_forged_record_of_the_configuration_in_effect_stops_no_start(
-    bare: Path, person: Person, configuration: str
-) -> None:
-    """Not even one of a commit that never was main, which nobody has approved."""
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-    if configuration == "side":
-        configuration = rig.git(bare, "commit-tree", "main^{tree}", "-p", "main", "-m", "x")
-    message = f"x\n\nWhy: x\n\nConfiguration: {configuration}\nRender-Version: 3\n"
-    person.change({}, message, FORGER)
-    with reader.opened(str(bare)) as repo:
-        (verdict,) = repo.verify([rig.tip(bare)])
-    assert verdict.fault
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(2))
-
-
-def test_a_submodule_in_place_of_a_claim_releases_nothing(generator: Generator, bare: Path) -> None:
-    rig.book(generator, goal(1), goal(2))
-    (path,) = rig.claims(bare, "fusion-1")
-    whole, index = text(bare, path), {"GIT_INDEX_FILE": str(bare / "index")}
-    rig.git(bare, "read-tree", "main", **index)
-    rig.git(bare, "update-index", "--cacheinfo", f"160000,{'1' * 40},{path}", **index)
-    tree = rig.git(bare, "write-tree", **index)
-    made = rig.git(bare, "commit-tree", tree, "-p", "main", "-m", "By hand")
-    rig.git(bare, "update-ref", "refs/heads/main", made)
-    rig.book(generator, goal(3))
-    assert text(bare, path) == whole
-    rig.assert_sound(bare)
-
-
-@pytest.mark.parametrize("message", ["By hand", "x\n\nWhy: x\n\nRender-Version: 3"])
-def test_a_broken_file_does_not_bring_back_a_claim_that_people_have_deleted(
-    bare: Path, person: Person, message: str
-) -> None:
-    """A start, a running generator and a reader agree, even if the commit looks a generator's."""
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1), goal(2))
-    repo, (path,) = pygit2.Repository(str(bare)), rig.claims(bare, "fusion-1")
-    start = snapshots.state_at(repo, rig.tip(bare))
-    deleted = snapshots.follow(repo, start, Oid(hex=person.change({path: None})), NOW).snapshot
-    broken = person.change({path: "kind: 5\n"}, message, FORGER if "Why" in message else None)
-    step = snapshots.follow(repo, deleted, Oid(hex=broken), NOW).snapshot
-    alone = snapshots.state_at(repo, broken)
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(3))
-    for found in (step, alone, generator.snapshot):
-        claims = {claim.path_of(each.key) for each in found.state.ledger}
-        assert claims
-        assert path not in claims
 
 
 def test_after_people_squash_a_history_that_is_not_valid_demands_wait_for_valid_files(

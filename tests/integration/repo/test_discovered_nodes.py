@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from demandops.decide.checks.collisions import all_names
+from demandops.decide.checks.forbidden import whole_usage
 from demandops.decide.discovery import ClusterNode
 from demandops.model.config.config import Config
 from demandops.serve import node_discovery
@@ -19,6 +21,7 @@ from tests.kit.repo import GitRepo, Person, assert_sound, commits, git, read
 
 FILE = "inventory/discovered/c-its.yaml"
 CLUSTERS = "inventory/clusters.yaml"
+POLICY = "policy/access-domains.yaml"
 FROM_CLUSTER = """\
 apiVersion: demandops/v1
 kind: Clusters
@@ -278,6 +281,66 @@ def test_a_cluster_whose_nodes_are_listed_again_leaves_no_file(
     look(running, clock)
     assert FILE not in GitRepo(bare).files()
     assert "bus0" not in running.snapshot.state.config.nodes
+    assert_sound(bare)
+
+
+def test_what_runs_is_not_planned_again(
+    running: Generator, fleet: Fleet, bare: Path, clock: Clock
+) -> None:
+    fleet.add("bus0", "bus1")
+    look(running, clock)
+    rig.book(running, put("d", "bus0", topic=("/vehicles/bus0/ego_data", "bus0")))
+    before = running.snapshot.state
+    names, usage = before.names(), before.usage()
+    fleet.add("bus2", "bus0", role="tram")
+    look(running, clock)
+    state = running.snapshot.state
+    assert state.config.nodes["bus0"].type == "tram"
+    assert state.names() is names
+    assert state.usage() is usage
+    assert (names, usage) == (all_names(state), whole_usage(state))
+    assert_sound(bare, verify_last=3)
+
+
+def test_a_node_of_a_pattern_becomes_the_one_of_the_cluster(
+    running: Generator, fleet: Fleet, bare: Path, clock: Clock, person: Person
+) -> None:
+    pattern = {"id": "bus{n}", "type": "bus", "cluster": "c-its", "ros": {"domainId": 7}}
+    listing = {"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": [pattern]}
+    person.fetch()
+    person.change({"inventory/nodes/buses.yaml": json.dumps(listing)})
+    running.fetch_now()
+    rig.book(running, put("d", "bus0", topic=("/vehicles/bus0/ego_data", "bus0")))
+    assert running.snapshot.state.config.nodes["bus0"].type == "bus"
+    fleet.add("bus0", role="tram")
+    look(running, clock)
+    assert running.snapshot.state.config.nodes["bus0"].type == "tram"
+    assert "~ " in newest(bare).partition("Desired state:")[2]
+    assert_sound(bare, verify_last=3)
+
+
+def test_odd_labels_leave_the_configuration_valid(
+    running: Generator, fleet: Fleet, bare: Path, clock: Clock, person: Person
+) -> None:
+    policy = plain_yaml.load(read(bare, POLICY))
+    policy["domains"][0]["nodes"] = ["vehicle*", "station*", "edge", "cloud", "bus*"]
+    policy["domains"].append(
+        policy["domains"][0] | {"name": "b", "namespace": "b", "nodes": ["*9"]}
+    )
+    nodes = read(bare, "inventory/nodes.yaml")
+    person.fetch()
+    size = "  - id: cloud\n    properties: {size: 3}\n"
+    listed_size = nodes.replace("  - id: cloud\n", size)
+    person.change({POLICY: json.dumps(policy), "inventory/nodes.yaml": listed_size})
+    fleet.add("bus1", **{"property.demandops/size": "3"})
+    fleet.add("bus2", "bus3", **{"property.demandops/size": "large"})
+    fleet.add("bus9")
+    look(running, clock)
+    config = running.snapshot.state.config
+    assert running.snapshot.faults == ()
+    assert [config.nodes[f"bus{n}"].properties for n in (1, 2, 3)] == [{"size": 3}, {}, {}]
+    assert "bus9" in config.nodes
+    assert "bus9" not in config.domain_of, "two access domains match it"
     assert_sound(bare)
 
 

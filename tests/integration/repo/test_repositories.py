@@ -92,25 +92,6 @@ def test_a_repo_that_borrows_objects_is_refused(bare: Path, tmp_path: Path) -> N
         StateRepository(tmp_path / "borrows.git")
 
 
-@pytest.mark.parametrize(
-    ("text", "what"),
-    [
-        ("", "corrupted loose reference file"),
-        ("x" * 40 + "\n", "corrupted loose reference file"),
-        ("1" * 40 + "\n", f"Git object {'1' * 40} is missing"),
-    ],
-)
-def test_a_branch_that_cannot_be_read_is_told_with_the_remedy(
-    bare: Path, text: str, what: str
-) -> None:
-    branch = bare / "refs/heads/main"
-    branch.parent.mkdir(exist_ok=True)
-    branch.write_text(text)
-    remedy = f"{what}.*; check its disk .* restore them from a backup"
-    with pytest.raises(StateRepoError, match=remedy):
-        StateRepository(bare)
-
-
 # ---- hooks and settings of its own: it is left as by `git push` ----
 
 

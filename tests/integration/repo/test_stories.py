@@ -319,8 +319,12 @@ class Story:
         self.change({path: text + self._person.read(path) for path, text in texts.items()})
 
     def forge(self, commit: Mapping[str, Any]) -> None:
-        """Commit in the generator's name, with trailers: texts of files, or a broken claim."""
-        lines = "".join(f"{key}: {value}\n" for key, value in commit["trailers"].items())
+        """Commit in the generator's name, with trailers: texts of files, or a broken claim.
+
+        A trailer may have the name of a revision that was noted.
+        """
+        trailers = commit["trailers"].items()
+        lines = "".join(f"{key}: {self._noted.get(text, text)}\n" for key, text in trailers)
         how = {"message": f"x\n\nWhy: x\n\n{lines}Render-Version: 3", "who": FORGER}
         if word := commit.get("claim"):
             self.edit_claim({word: "kind: 5\n"}, **how)

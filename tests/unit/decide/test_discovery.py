@@ -9,9 +9,19 @@ from demandops.decide.discovery import ClusterNode, discover
 from demandops.model.config import discovered
 from demandops.model.config.discovered import DiscoveredNode
 from demandops.model.config.inventory import Cluster
+from demandops.model.config.load import load
+from hypothesis import given
+from hypothesis import strategies as st
 
+from tests.kit.chance import examples
+from tests.kit.config import configuration
 from tests.kit.plain_yaml import beside
 
+FROM_CLUSTER = """\
+apiVersion: demandops/v1
+kind: Clusters
+clusters: [{name: c-its, nodes: from-cluster}]
+"""
 NOW = datetime(2026, 5, 4, 12, tzinfo=timezone.utc)
 CASES = beside(__file__)
 
@@ -51,3 +61,39 @@ def test_what_was_written_is_what_is_read() -> None:
     for case in CASES:
         text = nodes(case.get("after", []))
         assert discovered.text_of(discovered.read(text, "file")) == text
+
+
+odd = ["1", "true", "gpu", "0.5", "4Gi", "a..b", "é", "a b", "a/b", "a@b", "-a", "{n}", "x" * 64]
+anything = st.text(max_size=9) | st.sampled_from(odd)
+known = st.sampled_from(["demandops/type", "capability.demandops/gpu", "property.demandops/size"])
+keys = known | st.builds(str.__add__, st.sampled_from(["", "property.demandops/"]), anything)
+texts = st.dictionaries(keys, anything, max_size=5)
+
+
+@st.composite
+def cluster_nodes(draw: st.DrawFn) -> list[ClusterNode]:
+    ids = draw(st.lists(st.sampled_from(["bus0", "bus1", "cloud"]) | anything, max_size=4))
+    return [
+        ClusterNode(name, {**draw(texts), "node_id": id}, draw(texts), draw(st.booleans()), {})
+        for name, id in enumerate_names(ids)
+    ]
+
+
+def enumerate_names(ids: list[str]) -> list[tuple[str, str]]:
+    return [(f"machine-{number}", id) for number, id in enumerate(ids)]
+
+
+@given(cluster_nodes(), cluster_nodes())
+@examples(150)
+def test_whatever_a_cluster_says_the_configuration_stays_valid(
+    first: list[ClusterNode], second: list[ClusterNode]
+) -> None:
+    cluster = Cluster.model_validate({"name": "c-its", "nodes": "from-cluster"})
+    text = None
+    for seen in (first, second):
+        found = discover(cluster, seen, text, NOW, (), lambda id: False)
+        text = found.text
+        config = load(configuration({"inventory/clusters.yaml": FROM_CLUSTER, found.path: text}))
+        assert config.nodes["cloud"].type == "cloud", "as it is listed"
+        again = discover(cluster, seen, text, NOW, (), lambda id: False)
+        assert (again.text, again.came, again.left, again.changed) == (text, (), (), ())

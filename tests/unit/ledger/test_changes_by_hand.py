@@ -23,7 +23,7 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim, path_of
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, ledger_of
 
-from tests.kit.config import skeleton
+from tests.kit.config import edited, skeleton
 from tests.kit.goals import APP, CLOUD, Topic, application, connection, goal, put
 from tests.kit.memory import NOW, MemoryRepo, rebuilt
 
@@ -181,6 +181,18 @@ def test_a_claim_by_hand_that_doubles_a_route_is_invalid_and_a_restored_one_is_u
         for route in claim.connection.topics
     }
     assert carried == {("old", "/a"), ("new", "/b")}
+
+
+def test_an_edit_by_hand_changes_what_nodes_have_left() -> None:
+    appdef = "appdefs/object-detection-fusion/appdef.yaml"
+    repo = MemoryRepo(edited(appdef, "prefix: of", "prefix: of\n    requests: {cpu: 1}"))
+    repo.take_all([put("a"), put("b")])
+    known, ledger = repo.state, repo.state.ledger
+    known.usage()
+    gone = [claim for claim in ledger if claim.is_on_application][:1]
+    left = known.with_ledger(ledger.without(gone), [ClaimChange(gone[0], None)])
+    assert left.usage().amounts == replace(known, ledger=left.ledger).usage().amounts
+    assert left.usage().amounts != known.usage().amounts
 
 
 # ---- what a change of claims says about itself ----

@@ -33,6 +33,7 @@ from demandops.cli.target import (
     NO_STATE_REPO,
     dry_run_option,
     hint_to_pull,
+    hint_to_push,
     optional_repo_option,
     signing_option,
 )
@@ -397,7 +398,7 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
             known = "refused" if row["outcome"] == "refused" else "has no known outcome"
             errors.print(f"{title} {known}")
             by_text: dict[str, list[Fault]] = {}  # one reason may refuse several parts of a demand
-            for each in row["faults"]:
+            for each in sorted(row["faults"], key=lambda fault: fault["line"] or 0):
                 by_text.setdefault(each["message"], []).append(Fault(**each))
             for first, *others in by_text.values():
                 places = f"; so are {', '.join(each.field for each in others)}" if others else ""
@@ -424,3 +425,6 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
     if not dry_run and any(row["outcome"] in ("booked", "released") for row in rows):
         for line in hint_to_pull():
             errors.print(line)
+    codes = {each["code"] for row in rows for each in row["faults"]}
+    for line in hint_to_push() if codes & {"unknown-application", "unknown-node"} else ():
+        errors.print(line)

@@ -262,6 +262,10 @@ def _refuse_unknown(
         labels |= {column.key.removesuffix("s") for column in kind.columns} | {*FILTERS, kind.word}
     asked = [(name, kind.word, "", {row.item["name"] for row in rows}) for name in names]
     for label, pattern, option in wanted:
+        if label == "health" and rows and label not in labels:
+            raise click.UsageError(
+                f"{option}: the health is that of clusters: give --clusters FILE"
+            )
         if label not in labels:
             raise click.UsageError(
                 f"{option}: {kind.name}{' that are gone' if gone else ''} have no {label}; they "
@@ -281,7 +285,12 @@ def _refuse_unknown(
         of = KINDS.get(f"{label}s")
         past = past_rows(source, of.name)[0] if of and of.has_past else []
         if not is_in([row.item["name"] for row in past], pattern):
+            # a vehicle is a node too, but claims are asked for by requester
+            filters = sorted(FILTERS, key="requester".__ne__)
+            other = next((word for word in filters if is_in(existing[word], pattern)), "")
             hint = suggestion(pattern, candidates)
+            if other and not option:
+                hint = f"; to list those of the {other}: --{other} {quoted(pattern)}"
             faults.append(fault(option, f"nothing is called {quoted(pattern)}{hint}"))
         elif of and not gone:
             way = "add --gone" if kind.has_past else f"demandops get {of.name} --gone"

@@ -15,7 +15,7 @@ import click
 
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.runtime import REAL
-from demandops.cli.formats import Table, list_table, output_option, show
+from demandops.cli.formats import Table, list_table, output_formats, output_option, show
 from demandops.cli.output import busy, errors, painted, progress, read_by, warn_of_not_rendered
 from demandops.cli.queries.commits import in_effect, log_table
 from demandops.cli.target import clusters_option, state_repo_option
@@ -61,7 +61,7 @@ _PATIENCE_S = 10
     callback=read_by(seconds_of),
     help="How long a cluster may take to answer. All clusters are asked at the same time.",
 )
-@output_option
+@output_formats("text", "wide", "json")
 def status(
     state_repo: str,
     access_file: Path | None,
@@ -126,7 +126,8 @@ def status(
             text.insert(0, "1 problem:" if len(text) == 1 else f"{len(text)} problems:")
         if source.snapshot.faults:
             text.append(in_effect(repo, source.snapshot))
-    text.append(list_table(KINDS["releases"], rows_of(source, "releases"), source.now))
+    rows = rows_of(source, "releases")
+    text.append(list_table(KINDS["releases"], rows, source.now, wide=output == "wide"))
     text += map(str, (*source.old_bootstraps, *source.orphans))
     show(output, data, [*text, f"desired: {source.commit}"])
     warn_of_not_rendered(source.not_rendered)
@@ -137,7 +138,7 @@ def status(
     for name, reason in source.unreadable.items():
         errors.print(f"warning: cluster '{name}' cannot be read: {reason}")
     unwatched = ", ".join(f"'{name}'" for name in source.unwatched)
-    if unwatched and output == "text":
+    if unwatched and output != "json":
         errors.print(
             f"the state of cluster {unwatched} is unknown: give --clusters FILE (docs/status.md)"
         )

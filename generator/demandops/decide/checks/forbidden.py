@@ -54,6 +54,7 @@ def denial_faults(request: Demand, after: World, changes: Changes) -> Iterator[F
         return
     changed = {change.key.subject for change in changes.claims if not change.only_renews}
     wider = {change.key.subject for change in changes.claims if not change.only_narrows}
+    own = {change.key for change in changes.claims}
     for item in request.demanded:
         if item.held.subject not in changed:
             continue
@@ -83,7 +84,9 @@ def denial_faults(request: Demand, after: World, changes: Changes) -> Iterator[F
                 what = f" of connection '{route.listed}'" if route.listed else ""
                 topic = item.held.key_of(route).topic
                 carried = f"{topic}{what} is carried by connection '{item.held.id}', which "
-            how = "is denied" if override.deny else "is new, and refused"
+            claims = after.ledger.claims_on(item.held.subject)  # others may have it already
+            to_it = " to this demand" if any(claim.key not in own for claim in claims) else ""
+            how = "is denied" if override.deny else f"is new{to_it}, and refused"
             message = (
                 f"{carried}{how} by {override.path}{until}: {override.reason}; ask the "
                 f"override's owner, {override.owner}, or demand something else"

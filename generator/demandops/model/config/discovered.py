@@ -11,22 +11,32 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
-from typing import Literal
+from functools import lru_cache
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput
+from demandops.base.naming import id_problem
 from demandops.base.settings import API_VERSION
-from demandops.model.config.base_model import CamelModel, FileModel, Items, Moment, Word, parse_file
+from demandops.model.config.base_model import (
+    CamelModel,
+    FileModel,
+    Items,
+    Moment,
+    Word,
+    parse_file,
+    without,
+)
 from demandops.model.config.config import CLUSTERS_FILE, NODES_FILE, ConfigReader
 from demandops.model.config.entry_patterns import EntryPattern
 from demandops.model.config.inventory import (
     Cluster,
     Discovery,
     Kind,
+    LabelValue,
     Node,
-    NodeId,
     PropertyName,
     PropertyValue,
     Resources,
@@ -41,10 +51,14 @@ _NOTE = """\
 _IN_ENTRY = re.compile(r"nodes\[\d+\]\.(?!id$)(.*)")
 
 
+# The value of the label `node_id`
+DiscoveredId = Annotated[LabelValue, without(id_problem)]
+
+
 class DiscoveredNode(CamelModel):
     """What a cluster says of one node; the rest is in the cluster's ``discovery.entry``."""
 
-    id: NodeId
+    id: DiscoveredId
     type: Word | None = None
     capabilities: Items[Word] = ()
     properties: dict[PropertyName, PropertyValue] = Field(default_factory=dict)
@@ -70,6 +84,7 @@ def path_of(cluster: str) -> str:
     return f"{DISCOVERED_ROOT}/{cluster}.yaml"
 
 
+@lru_cache(maxsize=1024)  # each look at a cluster's nodes reads the file that was loaded
 def read(text: str | None, path: str) -> tuple[DiscoveredNode, ...]:
     return parse_file(DiscoveredNodesFile, text, path).nodes if text is not None else ()
 

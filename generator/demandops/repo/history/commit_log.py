@@ -459,6 +459,9 @@ def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | Non
     means the end of its day, and a time without seconds the end of its minute.
     """
     text = text.strip()
+    if (word := text.lower()) in ("today", "yesterday"):
+        day = now.astimezone(timezone.utc) - (_DAY if word == "yesterday" else timedelta())
+        text = f"{day:%Y-%m-%d}"
     try:
         return now - timedelta(seconds=seconds_of(text.removesuffix("ago").rstrip()))
     except ValueError:
