@@ -40,6 +40,9 @@ class _Format(click.Choice[str]):
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
         if value.startswith(_PATH) and any(choice.startswith(_PATH) for choice in self.choices):
             return value
+        if "=" in value and ctx is not None and ctx.info_name == "application":
+            message = "is how to print; list outputs of services in appdef.yaml (docs/appdef.md)"
+            self.fail(message, param, ctx)
         return super().convert(value, param, ctx)
 
 
@@ -189,6 +192,7 @@ class Table:
     styles: Mapping[str, str] = field(default_factory=dict)
     # Whether to keep every column and wrap nothing, however wide the table gets.
     whole: bool = False
+    how_to_see: str = "in a wider terminal"
 
     def lines(self, width: int, style: Callable[[str, str], str] | None = None) -> list[str]:
         # ``style`` returns a text in a style (``bold``, ``dim`` or a color); None is plain text
@@ -233,7 +237,7 @@ class Table:
                 row, shown, widths, lambda text: paint(text, self.styles.get(text, ""))
             )
         if left_out := [heads[at] for at in used if at not in shown]:
-            note = f"more columns in a wider terminal: {', '.join(left_out)}"
+            note = f"more columns {self.how_to_see}: {', '.join(left_out)}"
             lines += [paint(line, "dim") for line in _wrapped(note, width)]
         return [*title, *lines]
 
@@ -283,7 +287,10 @@ _COLORS = {"bad": "red", "busy": "yellow", "good": "green", "none": ""}
 STYLES = {word: _COLORS[tone] for word, tone in TONES.items()}
 
 
-def list_table(kind: Kind, rows: Sequence[Row], now: datetime, *, wide: bool = False) -> Table:
+def list_table(
+    kind: Kind, rows: Sequence[Row], now: datetime, *, wide: bool | None = None
+) -> Table:
+    # ``wide`` is None for a command without ``-o wide``
     columns = [column for column in kind.columns if wide or not column.only_wide]
     cells = [[column.texts(row.item, now) for column in columns] for row in rows]
     if not wide:  # of long lists the beginning, so that most rows have one line
@@ -303,4 +310,6 @@ def list_table(kind: Kind, rows: Sequence[Row], now: datetime, *, wide: bool = F
                 since = parse_time(time) if (time := row.item[column.key]) else None
                 clock = since and f"{since.astimezone(timezone.utc):%Y-%m-%d %H:%M:%S}"
                 texts.append([clock] if clock else [])
-    return Table(columns, cells, empty=f"no {kind.name}", styles=STYLES, whole=wide)
+    how_to_see = "in a wider terminal" if wide is None else "with -o wide"
+    more: dict[str, Any] = {"whole": bool(wide), "how_to_see": how_to_see}
+    return Table(columns, cells, empty=f"no {kind.name}", styles=STYLES, **more)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import shlex
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial, reduce
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,10 +17,18 @@ from demandops.base.errors import InvalidInput, StateRepoError, suggestion
 from demandops.base.naming import SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.strict_yaml import located_in
+from demandops.cli.output import errors
 from demandops.decide.planning.planner import all_keys, plan
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, parse_file
+from demandops.model.config.config import CONFIG_ROOTS
 from demandops.repo import reader
-from demandops.repo.git.remote_repository import checkout_around, is_url, origin_of
+from demandops.repo.git.remote_repository import (
+    changed_in,
+    checkout_around,
+    commits_behind,
+    is_url,
+    origin_of,
+)
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 
@@ -164,6 +173,19 @@ def hint_to_pull() -> list[str]:
     return ["to see the new commit in this checkout: git pull"] if behind else []
 
 
+def hint_to_push() -> list[str]:
+    # what a person has just written in the checkout counts only once it is on main
+    around = _checkout()
+    files = (
+        [path for path in changed_in(around) if path.split("/")[0] in CONFIG_ROOTS]
+        if around
+        else []
+    )
+    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
+    told = f"note: only in this checkout, not on main: {', '.join(files[:3])}{more}"
+    return [f"{told}; commit and push to demand with them"] if files else []
+
+
 def _from_context(field: str) -> Callable[[], str | None]:
     def default() -> str | None:
         context = click.get_current_context().meta.get(_CONTEXT)
@@ -208,6 +230,9 @@ def _state_repo(*, writes: bool = True, required: bool = True) -> Callable[[Comm
             value = default()
         if value is None and required:
             raise click.UsageError(NO_STATE_REPO, ctx)
+        if value and not writes and (behind := commits_behind(Path(value))):
+            lacks = "1 commit" if behind == 1 else f"{behind} commits"
+            errors.print(f"note: this checkout is {lacks} behind main: git pull")
         return value or ""
 
     option = click.option(
@@ -299,6 +324,14 @@ def name_options(helps: dict[str, str], **more: Any) -> Callable[[Command], Comm
             for name, text in helps.items()
         )
     )
+
+
+def options_for(repo: Reader, name: str, kinds: Iterable[str]) -> str:
+    """Return a hint for a name that was given without the option that says what it is."""
+    meant = [
+        f"--{kind} {shlex.quote(name)}" for kind in kinds if name in all_names(repo, f"{kind}s")
+    ]
+    return f"; did you mean: {' or '.join(meant)}" if meant else ""
 
 
 def all_names(repo: Reader, kind: str) -> Iterator[str]:

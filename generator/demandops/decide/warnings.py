@@ -165,30 +165,34 @@ _SHORT = 4
 
 def notes(request: Demand, before: World) -> Iterator[str]:
     # ``before`` is the world before the demand, or its own topics would all be known
-    known: dict[str, set[str]] = {}
+    demanded: dict[str, set[str]] = {}
     told = set[tuple[str, str]]()
     for item in request.demanded if request.adds_claims else ():
         what = "application" if isinstance(item.held, Application) else "connection"
         for node, topic in _named_topics(item.held):
-            if (node, topic) in told:
+            entry, listed = before.config.nodes.get(node), set[str]()
+            if entry:
+                listed.update(entry.topics.values(), entry.types, *entry.bridged.values())
+            if (node, topic) in told or topic in listed:
                 continue
             told.add((node, topic))
-            # thousands of claims may read from a node, but nearly always one of them names the
-            # topic
+            near = [each for each in listed if _is_misspelling(topic, each)]
+            # what others demand proves a topic, but not beside one of the inventory. Thousands of
+            # claims may read from a node, but nearly always one of them names the topic.
             reading = before.ledger.each_with("takes", node, topic)
-            if any(claim.demand != request.demand for claim in reading):
+            if not near and any(claim.demand != request.demand for claim in reading):
                 continue
-            if node not in known:
-                entry, known[node] = before.config.nodes.get(node), set()
-                if entry:
-                    known[node].update(entry.topics.values(), entry.types, *entry.bridged.values())
-                for claim in before.ledger.each_with("from", node):
-                    if claim.demand != request.demand:
-                        topics = _named_topics(claim.held)
-                        known[node] |= {named for sender, named in topics if sender == node}
-            if topic in known[node]:
-                continue
-            if near := [each for each in known[node] if _is_misspelling(topic, each)]:
+            if not near and node not in demanded:
+                demanded[node] = {
+                    named
+                    for claim in before.ledger.each_with("from", node)
+                    if claim.demand != request.demand
+                    for sender, named in _named_topics(claim.held)
+                    if sender == node
+                }
+            if not near and topic not in demanded[node]:
+                near = [each for each in demanded[node] if _is_misspelling(topic, each)]
+            if near:
                 meant = f"did you mean '{min(near)}'?"
                 yield f"{what} '{item.held.id}': '{node}' is not known to publish {topic}; {meant}"
 

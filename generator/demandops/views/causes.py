@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from typing import Literal
 
-from demandops.base.errors import Fault
 from demandops.decide.planning.overrides import suspended_claims
 from demandops.model.config.config import IMAGES_FILE
 from demandops.model.config.override import Override
@@ -113,15 +112,11 @@ def _unread_or_invalid(source: Source) -> Iterator[Cause]:
             else "the person who last changed it",
             source.remedy or "correct the file by pull request",
             f"git show {problem.since[:10]}" if problem.since else "demandops check .",
-            told="\n".join(_told(each) for each in (problem, *others))
+            told="\n".join(str(each._replace(since="")) for each in (problem, *others))
             if others
             else problem.message,
             since=change.time if change else None,
         )
-
-
-def _told(problem: Problem) -> str:
-    return str(Fault("invalid", problem.field, problem.message, problem.file, problem.line))
 
 
 def _denied(source: Source) -> Iterator[Cause]:

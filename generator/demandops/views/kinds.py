@@ -23,6 +23,7 @@ from demandops.decide.bookkeeping import (
     versions_asked,
 )
 from demandops.decide.planning.overrides import suspended_by
+from demandops.decide.planning.planner import running_version
 from demandops.model.config.base_model import duration_text, parse_file, parse_time, relative
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
@@ -329,11 +330,12 @@ def _applications(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 def _application(source: Source, claims: tuple[Claim, ...], state: str, runs: Json) -> Json:
     app = claims[0].application
+    running = running_version(source.state, app.id)
     return {
         "name": app.id,
         "appdef": app.appdef,
         "node": app.node,
-        "version": app.version or None,
+        "version": (running.name if running else "") or app.version or None,
         **_held(source, claims, state),
         "demands": [*dict.fromkeys(claim.demand for claim in claims)],
         **runs,
@@ -581,6 +583,10 @@ def _properties(item: Json, now: datetime) -> list[str]:
     return [f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()]
 
 
+def _quotas(item: Json, now: datetime) -> list[str]:
+    return [f"{name}: {most}" for name, most in item["quotas"].items()]
+
+
 def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     nodes: defaultdict[str, list[str]] = defaultdict(list)
     clusters: defaultdict[str, set[str]] = defaultdict(set)
@@ -596,6 +602,7 @@ def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
             "when_full": domain.when_full,
             "network": domain.network,
             "rules": len(domain.rules),
+            "quotas": domain.quotas.model_dump(by_alias=True, exclude_none=True),
             "clusters": sorted(clusters[name]),
             "nodes": nodes[name],
             "file": source.config.file_of(DOMAINS_FILE, name),
@@ -824,7 +831,8 @@ KINDS: dict[str, Kind] = {
                 *(Column("name", "Domain"), Column("approval", "Approval", 2)),
                 *(Column("when_full", "When full", 5), Column("namespace", "Namespace", 4)),
                 *(Column("clusters", "Clusters", 3), Column("nodes", "Nodes", 1, links="node")),
-                *(Column("rules", "Rules", 6), _wide("file", "File")),
+                *(Column("rules", "Rules", 6), _wide("quotas", "Quotas", texts_of=_quotas)),
+                _wide("file", "File"),
             ),
             _domains,
         ),

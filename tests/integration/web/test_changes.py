@@ -241,6 +241,8 @@ def test_what_is_gone_has_a_list_of_its_own(booked: Generator, look: Look) -> No
     (row,) = page.texts("tr")[1:]
     assert re.match(r"mine gone [0-9]+s ago by .*, release in [0-9a-f]{10} vehicle02", row)
     assert "gone=1" in look("/connections").link("Those that are gone")
+    for name in LISTS:
+        look(f"/{name}", gone="1")
 
 
 def test_a_state_repo_that_is_away_is_told_and_followed_again(

@@ -14,6 +14,7 @@ from demandops.cli.formats import output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.queries.commits import entry_lines, release_lines
 from demandops.decide.state import FileChange
+from demandops.detect import rule_file
 from demandops.repo.merge_check import merge_check
 from demandops.repo.merge_check.merge_check import CheckResult
 from demandops.repo.merge_check.rendered_charts import MISSING, NO_HELM, RenderedCharts
@@ -132,8 +133,8 @@ _MOST_DIFF_LINES_JSON = 20_000
 @click.command()
 @click.argument(
     "directory",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    metavar="[DIR]",
+    type=click.Path(path_type=Path, exists=True),
+    metavar="[DIR|RULES]",
     default=Path(),
 )
 @click.option(
@@ -156,13 +157,18 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
     version. If a generated file is edited, the command prints the override to write instead. Helm
     lints the charts, and renders them for the current releases and for an example of each
     application. Then the command shows what a merge changes: releases, files and bookkeeping.
-    docs/pull-requests.md describes the check in a pipeline.
+    docs/pull-requests.md describes the check in a pipeline. RULES is a file of rules of the
+    detector, of which only the file is checked.
 
     \b
     Examples:
       demandops check
       demandops check . --base origin/main --output markdown
     """
+    if directory.is_file():
+        rules = rule_file.read(directory.read_text(), str(directory))
+        click.echo(f"{directory}: valid; rules: {', '.join(each.name for each in rules.rules)}")
+        return
     with busy("checking"), processor_time(each=2, together=60):
         checked = merge_check.check(directory, base, require_helm=require_helm)
     if output == "json":

@@ -39,7 +39,6 @@ from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFi
 from demandops.model.ledger.claim import LEDGER_ROOT
 from demandops.repo import reader
 from demandops.repo.history import commit_log
-from demandops.repo.reader import Reader
 from demandops.views.vocabulary import Json, override_data
 
 # ---- what the commands share: their options and selection ----
@@ -59,12 +58,6 @@ selecting = target.name_options(
 
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
     return {name: list(values) for name, values in given.items() if values}
-
-
-def _options_for(repo: Reader, name: str) -> str:
-    # what a name means that was given without an option
-    kinds = [kind for kind in _SELECTED if name in all_names(repo, f"{kind}s")]
-    return " or ".join(f"--{kind} {shlex.quote(name)}" for kind in kinds)
 
 
 def ends_at(text: str | None) -> str | None:
@@ -271,12 +264,8 @@ def _end(
             message = "is not valid, so nothing is overridden; correct or remove the file with git"
             raise InvalidInput.at("", message, file=_path_of(name))
         if override is None:
-            close = suggestion(name, overrides)
-            message = f"there is no override '{name}'; did you mean: {_options_for(repo, name)}"
-            message = (
-                message if _options_for(repo, name) else f"there is no override '{name}'{close}"
-            )
-            raise InvalidInput.at("", message)
+            hint = target.options_for(repo, name, _SELECTED) or suggestion(name, overrides)
+            raise InvalidInput.at("", f"there is no override '{name}'{hint}")
         # a person may have changed what the file selects since it was suspended
         selects = [select.model_dump(exclude_none=True).items() for select in override.select]
         wanted = [{kind: {*values} for kind, values in selector(selected).items()}]
@@ -317,9 +306,8 @@ def suspend(expires: str | None, options: Options, **selected: tuple[str, ...]) 
     """
     if names := click.get_current_context().args:
         with reader.opened(options.state_repo, only_read=True) as repo:
-            meant = _options_for(repo, names[0])
-        told = f"; did you mean: {meant}" if meant else ""
-        raise click.UsageError(f"say by an option what {quoted(names[0])} is{told}")
+            hint = target.options_for(repo, names[0], _SELECTED)
+        raise click.UsageError(f"say by an option what {quoted(names[0])} is{hint}")
     effect = {"expires": expires, "deny": True}
     _create(name_of(selected), f"Suspend {described(selected)}", selected, effect, options)
 

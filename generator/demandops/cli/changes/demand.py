@@ -33,6 +33,7 @@ from demandops.cli.target import (
     NO_STATE_REPO,
     dry_run_option,
     hint_to_pull,
+    hint_to_push,
     optional_repo_option,
     signing_option,
 )
@@ -424,3 +425,6 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
     if not dry_run and any(row["outcome"] in ("booked", "released") for row in rows):
         for line in hint_to_pull():
             errors.print(line)
+    codes = {each["code"] for row in rows for each in row["faults"]}
+    for line in hint_to_push() if codes & {"unknown-application", "unknown-node"} else ():
+        errors.print(line)

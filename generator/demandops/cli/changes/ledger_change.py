@@ -26,7 +26,7 @@ from demandops.cli.changes.person_change import (
 from demandops.cli.formats import show
 from demandops.cli.output import busy, done, errors, fitted, progress, terminal_width
 from demandops.cli.queries.commits import resolved
-from demandops.cli.target import name_options, names_of
+from demandops.cli.target import name_options, names_of, options_for
 from demandops.decide.decision import decide
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS
@@ -334,14 +334,8 @@ def rollback(
         try:
             to = resolved(repo, revision or f"{next(about, MAIN_BRANCH)}~1")
         except StateRepoError as error:
-            held = {
-                "demand": state.ledger.indexed_names("demand"),
-                "application": state.ledger.subjects(SubjectKind.APPLICATION),
-            }
-            for kind in (kind for kind, names in held.items() if revision in names):
-                way = f"demandops rollback --{kind} {shlex.quote(revision)} -m REASON"
-                raise StateRepoError(f"{error}; did you mean: {way}") from None
-            raise
+            hint = options_for(repo, revision, ("demand", "application"))
+            raise StateRepoError(f"{error}{hint}") from None
         since = repo.changed_files(to, repo.commit(), CONFIG_ROOTS)
         people = (each.commit for each in repo.log(f"{to}..") if since and not each.by_generator)
         edits = [each for each in people if not {*since}.isdisjoint(repo.files_changed_by(each))]

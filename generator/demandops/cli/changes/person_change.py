@@ -85,14 +85,10 @@ class Options:
     def with_reason(self) -> Options:
         reason = self.reason
         if not reason and sys.stdin.isatty() and not self.yes:
-            reason = _in_one_line(click.prompt("Why", err=True))
+            reason = " ".join(click.prompt("Why", err=True).split())
         if not reason:
             raise click.UsageError("give the reason: -m TEXT")
         return replace(self, reason=reason)
-
-
-def _in_one_line(text: str) -> str:
-    return " ".join(text.split())
 
 
 def changing(
@@ -110,7 +106,7 @@ def changing(
                 "-m",
                 "--reason",
                 metavar="TEXT",
-                callback=lambda ctx, param, text: _in_one_line(text or ""),
+                callback=lambda ctx, param, text: " ".join((text or "").split()),
                 help="Why; the commit message says it, and the file of an override.",
             ),
             *more,

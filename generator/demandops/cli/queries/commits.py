@@ -47,6 +47,8 @@ from demandops.views.vocabulary import commit_data, time_text
 def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     """Show who requests which service and connection.
 
+    What one of them holds: demandops get demands --requester NAME, and demandops get requesters.
+
     \b
     Examples:
       demandops bookkeeping

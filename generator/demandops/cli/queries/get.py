@@ -285,7 +285,12 @@ def _refuse_unknown(
         of = KINDS.get(f"{label}s")
         past = past_rows(source, of.name)[0] if of and of.has_past else []
         if not is_in([row.item["name"] for row in past], pattern):
+            # a vehicle is a node too, but claims are asked for by requester
+            filters = sorted(FILTERS, key="requester".__ne__)
+            other = next((word for word in filters if is_in(existing[word], pattern)), "")
             hint = suggestion(pattern, candidates)
+            if other and not option:
+                hint = f"; to list those of the {other}: --{other} {quoted(pattern)}"
             faults.append(fault(option, f"nothing is called {quoted(pattern)}{hint}"))
         elif of and not gone:
             way = "add --gone" if kind.has_past else f"demandops get {of.name} --gone"

@@ -189,6 +189,8 @@ def _definition_faults(  # noqa: PLR0912 - a branch for each fault
         listed = config.entry_files.get(VERSIONS_FILE, {}).get(appdef.name)
         where = f"{appdef.name} in {listed or config.place_of(CHARTS_FILE)}"
         message = f"{quoted(app.version)} is not a version or channel of {where}"
+        if not listed:
+            message += f", and {VERSIONS_FILE} lists none of this type"
         yield fault("version", message + suggestion(app.version, versions))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime, timezone
 from fnmatch import translate
 from functools import lru_cache
@@ -282,16 +282,34 @@ _EXPECTED = {
 }
 
 
+_schema = lru_cache(maxsize=64)(lambda model: model.model_json_schema())
+
+
+def _fields_at(part: Any, place: Sequence[int | str], whole: Any) -> set[str]:  # noqa: ANN401
+    # the names of the fields that people may write at a place, by a part of a JSON schema
+    if not isinstance(part, dict):
+        return set()
+    parts = [*part.get("anyOf", ())]
+    if "$ref" in part:
+        parts.append(whole["$defs"][part["$ref"].rpartition("/")[2]])
+    names = {name for each in parts for name in _fields_at(each, place, whole)}
+    own = part.get("properties", {})
+    if not place:
+        return {*names, *own}
+    inside = [part.get("items"), part.get("additionalProperties"), own.get(place[0])]
+    inside += part.get("patternProperties", {}).values()
+    return names.union(*(_fields_at(each, place[1:], whole) for each in inside))
+
+
 def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
     kind, value = item["type"], item.get("input")
     if kind == "missing":
         return "is missing; add it"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        message = "is not a field here; remove it or correct its spelling"
-        if len(item["loc"]) == 1:  # deeper, the field belongs to a model that is not known here
-            fields = [field.alias or name for name, field in model.model_fields.items()]
-            message += suggestion(str(item["loc"][-1]), fields)
-        return message
+        *place, name = item["loc"]
+        schema = _schema(model)
+        known = suggestion(str(name), _fields_at(schema, place, schema))
+        return f"is not a field here; remove it or correct its spelling{known}"
     if kind == "string_type" and isinstance(value, int | float):
         return f"must be text, not {strict_yaml.short_repr(value)}; put it in quotes"
     if kind == "literal_error":

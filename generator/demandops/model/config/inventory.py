@@ -360,6 +360,16 @@ class Position(CamelModel):
     x: Coordinate
     y: Coordinate
 
+    @model_validator(mode="before")
+    @classmethod
+    def _in_metres(cls, data: object) -> object:
+        if isinstance(data, dict) and "latitude" in data:
+            raise ValueError(
+                "has x and y, in metres of the map frame; in detector rules, 'map' says where that "
+                "frame is on earth, and only sources report degrees"
+            )
+        return data
+
 
 class FurtherDomain(CamelModel):
     """A further access domain of a node, besides the domain whose patterns match the node."""

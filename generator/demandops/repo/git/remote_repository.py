@@ -29,7 +29,7 @@ from demandops.base.addresses import holds_secret, without_secrets
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
-from demandops.base.settings import MAIN_BRANCH
+from demandops.base.settings import MAIN_BRANCH, data_home
 from demandops.repo.git import child_processes
 from demandops.repo.git import repository as repositories
 from demandops.repo.git.objects import NewObjects
@@ -529,6 +529,35 @@ def origin_of(checkout: Path) -> str | None:
     except pygit2.GitError:
         return None
     return remotes.get("origin")
+
+
+def commits_behind(checkout: Path) -> int:
+    """Return how many commits of its origin's main a checkout of main lacks.
+
+    Main is as a fetch of the checkout, or a command on this machine, has left it.
+    """
+    lacking = [0]
+    with suppress(pygit2.GitError, KeyError, ValueError):
+        repo, origin = Repository(str(checkout)), origin_of(checkout) or ""
+        home = data_home(origin)
+        clones = [*home.glob("*/clone.git"), *home.glob("reader/*/clone.git")]
+        places = [(origin, MAIN), *((place, _REMOTE_MAIN) for place in (checkout, *clones))]
+        for place, reference in places if repo.head.shorthand == MAIN_BRANCH else ():
+            with suppress(pygit2.GitError, KeyError, ValueError):  # a URL; not yet fetched
+                other = Repository(str(place))
+                tip = other.references[reference].target
+                lacking.append(other.ahead_behind(repo.head.target, tip)[1])
+    return max(lacking)
+
+
+def changed_in(checkout: Path) -> list[str]:
+    """Return the files of a checkout that are not like this on its origin's main."""
+    with suppress(pygit2.GitError, KeyError, ValueError):
+        repo = Repository(str(checkout))
+        main = repo.branches[f"origin/{MAIN_BRANCH}"].target
+        committed = repo.diff(repo.merge_base(repo.head.target, main) or main, repo.head.target)
+        return sorted({*repo.status(), *(delta.new_file.path for delta in committed.deltas)})
+    return []
 
 
 def is_url(address: str) -> bool:
