@@ -34,6 +34,7 @@ OF_THE_ROOT = {
     "CONTRIBUTING.md": "project/contributing.md",
     "appdefs/charts/ros-service/README.md": "project/ros-service.md",
     "examples/experiment/rules.yaml": "project/rules.yaml",
+    "examples/experiment/unlisted/rules.yaml": "project/unlisted-rules.yaml",
     "examples/lane-detection/README.md": "project/lane-detection.md",
     "examples/lane-detection/appdefs/lane-detection/charts/ros-launch/README.md": (
         "project/ros-launch.md"

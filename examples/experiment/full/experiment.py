@@ -100,7 +100,8 @@ class Experiment:
     def _files(self, ports: dict[str, int]) -> dict[str, str]:
         """Return the fleet's files of the state repo, for brokers at these ports."""
         paths = ("inventory/nodes.yaml", "registry/images.yaml")
-        return fleet.files(*map(self._world.file, paths), self._domains, ports)
+        carrier = self._settings.connections
+        return fleet.files(*map(self._world.file, paths), self._domains, ports, carrier)
 
     def _observe(self, observer: Any) -> Any:
         observer.start()

@@ -27,7 +27,7 @@ STATION_CLOUD_TARGET = f"/stations/{S}/pointcloud"
 
 
 def files(
-    nodes: str, images: str, domains: dict[str, int], ports: dict[str, int]
+    nodes: str, images: str, domains: dict[str, int], ports: dict[str, int], carrier: Carrier
 ) -> dict[str, str]:
     """Return what differs from the skeleton's files, of which `nodes` and `images` are two.
 
@@ -39,8 +39,9 @@ def files(
     for node in inventory["nodes"]:
         if node["id"] in domains:  # a pattern has its own
             node["ros"]["domainId"] = domains[node["id"]]
-        edge = {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
-        node["zenoh"] = edge if node["id"] == "edge" else {}
+        if carrier == "zenoh":  # a derived connection is of this type wherever it can be
+            edge = {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
+            node["zenoh"] = edge if node["id"] == "edge" else {}
     brokers = [{"node": node, "host": "127.0.0.1", "port": port} for node, port in ports.items()]
     synchronized = override({"services": ["object-fusion"]}, values={"watcher": _WATCHER})
     return {

@@ -14,7 +14,8 @@ from typing import Any
 import paho.mqtt.client as mqtt
 import rclpy
 from application_manager_interfaces.action import DeploymentRequest
-from demandops.base.settings import DEFAULT_ACTION_NAME
+from demandops.base.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
+from demandops_interfaces.action import Demand
 from demandops_ros.actions import DEEP_QOS
 from demandops_ros.ros_process import ExecutorThread
 from geometry_msgs.msg import PoseArray, PoseStamped
@@ -100,12 +101,10 @@ class CloudObserver(Observer):
         self.stages: dict[bytes, dict[str, tuple[float, str]]] = defaultdict(dict)
         for vehicle in vehicles:
             self.watch(PoseStamped, POSE.format(vehicle))
-        self.node.create_subscription(
-            DeploymentRequest.Impl.FeedbackMessage,
-            f"{DEFAULT_ACTION_NAME}/_action/feedback",
-            self._take_feedback,
-            DEEP_QOS,
-        )
+        actions = {DEFAULT_ACTION_NAME: DeploymentRequest, DEFAULT_DEMAND_ACTION_NAME: Demand}
+        for name, action in actions.items():
+            kind, topic = action.Impl.FeedbackMessage, f"{name}/_action/feedback"
+            self.node.create_subscription(kind, topic, self._take_feedback, DEEP_QOS)
 
     def _take_feedback(self, message: Any) -> None:
         stage, _, rest = message.feedback.message.partition(" ")

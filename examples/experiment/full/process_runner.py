@@ -211,8 +211,9 @@ class ProcessRunner:
             mounts = {
                 mount["mountPath"]: places[mount["name"]] for mount in container["volumeMounts"]
             }
-            program = container.get("command", self._entry_point(container["image"]))
-            wanted = [*program, *container.get("args", ())]
+            given_args = container.get("args", [])
+            program = container.get("command", self._entry_point(container["image"], given_args))
+            wanted = [*program, *given_args]
             given = {
                 each["name"]: path_in_pod(each["value"], mounts)
                 for each in container.get("env", ())
@@ -223,10 +224,11 @@ class ProcessRunner:
                 container["name"], [path_in_pod(part, mounts) for part in wanted], given
             )
 
-    def _entry_point(self, image: str) -> list[str]:
+    def _entry_point(self, image: str, arguments: list[str]) -> list[str]:
         """Return the stand-in for an image's entry point; without it arguments are the command."""
         program = program_of(image)
-        return [program] if (self._image / program).exists() else []
+        is_named = arguments[:1] == [program]
+        return [program] if (self._image / program).exists() and not is_named else []
 
     def _fill(self, pod: RunningPod, volume: dict[str, Any]) -> Path:
         """Write the files of a volume, each atomically; return the volume's folder."""

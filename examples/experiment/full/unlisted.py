@@ -73,7 +73,8 @@ class UnlistedExperiment(Experiment):
     def _files(self, ports: dict[str, int]) -> dict[str, str]:
         nodes = (FILES / "nodes.yaml").read_text()
         images = self._world.file("registry/images.yaml")
-        return fleet.files(nodes, images, self._domains, ports) | self._own_application()
+        own = fleet.files(nodes, images, self._domains, ports, self._settings.connections)
+        return own | self._own_application()
 
     def _own_application(self) -> dict[str, str]:
         """Lay an application down as a user would, and install its node where the pods run."""

@@ -60,9 +60,8 @@ def disallowed_files(  # noqa: PLR0912 - a branch for each kind of file
     for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
         demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
     named = {f"{claim_files.segment(demand)}.yaml" for demand in demands}
-    # a claim may be put back as it was at the generator's commit before
+    # a claim may be put back as it was at the generator's commit before, or after it
     since = entry.first("Since") if operation == "follow" else ""
-    earlier = trees.commit_of(repo, since).tree if since else None
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
         # of a folder, the files count
@@ -77,7 +76,7 @@ def disallowed_files(  # noqa: PLR0912 - a branch for each kind of file
         only_removes = old is not None and without_ignored_fields(path, old) == new
         if operation == "upgrade" and (path == ROOT_FILE or only_removes):
             continue
-        is_put_back = earlier is not None and trees.entry_id(earlier, path) == blob
+        is_put_back = bool(since) and _stood_since(repo, commit, since, path, blob)
         if discovered.is_discovered(path):
             if not (is_put_back or (operation == "discover" and _is_as_written(new, path))):
                 yield path
@@ -92,6 +91,15 @@ def disallowed_files(  # noqa: PLR0912 - a branch for each kind of file
                 yield path
         elif (operation not in _REWRITING or not _only_rewrites(commit, path)) and not is_put_back:
             yield path
+
+
+def _stood_since(repo: Repository, commit: Commit, since: str, path: str, blob: Oid | None) -> bool:
+    # what people deleted, and then broke, stays deleted
+    while commit.parents and str(commit.id) != since:
+        commit = commit.parents[0]
+        if trees.entry_id(commit.tree, path) == blob:
+            return True
+    return False
 
 
 def _is_as_written(text: str | None, path: str) -> bool:
