@@ -54,7 +54,7 @@ def test_a_scaffolded_application_follows_50_changes_without_a_restart(world: Wo
         return said
 
     assert "starts ear-edge-ears" in demand(joins("station00"))
-    (name,) = (each for each in domain.names("Deployment") if each.startswith("ear-"))
+    (name,) = (each for each in domain.releases() if each.startswith("ear-"))
 
     def inputs() -> list[str]:
         text = domain.get("ConfigMap", f"{name}-params")["data"]["params.yml"]
@@ -69,8 +69,8 @@ def test_a_scaffolded_application_follows_50_changes_without_a_restart(world: Wo
         counts = (each["restartCount"] for each in pod["status"]["containerStatuses"])
         return (*domain.identity(name), *counts)
 
-    domain.wait("the first input", lambda: inputs() == ["/station00/wave"])
     domain.wait("its pod", lambda: ("ear-edge-ears", "edge") in domain.pods())
+    domain.wait("the first input", lambda: inputs() == ["/station00/wave"])
     before = lives()
     for turn in range(ROUNDS):
         goals = []
