@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import importlib.util
 import json
 import os
 import re
@@ -221,7 +222,10 @@ def _name_of(folder: Path) -> str:
     name = named[1] if named else folder.name
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise Refused(f"{folder}: {name!r} is no name of a package; rename the folder")
-    if name in PACKAGES or any(SITE.glob(f"ros_{name}-*.dist-info")):
+    # a module of another kind would be removed with what an earlier build installed
+    known = importlib.util.find_spec(name)
+    other = known is not None and known.origin is not None and not (SITE / name / "msg").is_dir()
+    if name in PACKAGES or other or any(SITE.glob(f"ros_{name}-*.dist-info")):
         raise Refused(f"{folder}: {name} is installed already; leave it out")
     return name
 

@@ -104,6 +104,13 @@ def test_any_id_is_one_node_or_none(id: str) -> None:
     assert node is None or (node.id == id and config.domain_of[id] is not None)
 
 
+def test_an_id_of_any_length_is_refused_as_what_it_is() -> None:
+    repo = MemoryRepo(inventory({"id": "vehicle{n}"} | VEHICLE))
+    for id in (f"vehicle{'9' * 5000}", "@" * 1000, "a@" * 5000):
+        faults = repo.faults(put("d", id, id="fusion", topic=("/ego", id)))
+        assert any("is not in inventory/nodes.yaml" in told for told in faults), faults
+
+
 def test_a_pattern_has_its_namespaces_and_its_part_of_the_rule_of_its_cluster() -> None:
     own_label = {"id": "bus{n}", "type": "bus", "cluster": "c-its", "selector": {"vin": "b.{n}"}}
     config = load(configuration(inventory({"id": "vehicle{n}"} | VEHICLE, own_label)))

@@ -20,6 +20,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from demandops.base.errors import InvalidInput, fault, field_path
+from demandops.base.naming import MAX_ID
 from demandops.base.placeholders import (
     example_of,
     filled,
@@ -207,6 +208,8 @@ class EntryPatterns(Generic[Entry]):
         return (pattern for _, pattern in self._globs.matching(id))
 
     def _find(self, id: str) -> tuple[Entry | None, str]:
+        if len(id) > MAX_ID:  # this is refused, but only after it was looked for
+            return None, ""
         patterns = [pattern for pattern in self.candidates(id) if pattern.values(id)]
         if len(patterns) > 1:
             named = " and ".join(f"{quoted(each.id)} in {each.where}" for each in patterns[:2])
@@ -267,8 +270,8 @@ class UnlistedNodes:
         self.find = lru_cache(maxsize=65_536)(self._find)
 
     def _find(self, id: str) -> Unlisted | None:
-        host, _, name = id.rpartition("@")
-        if not host:
+        host, at, name = id.partition("@")
+        if not at:
             node, domain, _ = self._made(id)
             return Unlisted(self._complete(node, domain), domain, id) if node else None
         of_host, domain = self.find(host), self._domains.get(name)

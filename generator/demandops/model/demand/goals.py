@@ -164,6 +164,10 @@ _TOO_DEEP = f"is nested deeper than {_DEEPEST} levels; make it flatter"
 # characters, in which an escape counts as several.
 _LONGEST_KEY = 128
 
+# Helm's toJson writes these as they are, and no YAML may have them: the release would fail for all.
+_CONTROL = re.compile("[\x7f-\x9f\ufffe\uffff]")
+_EXACT = 2**53  # up to here, Helm reads each integer as it is
+
 
 def _value_problem(value: object, depth: int) -> str:
     if depth > _DEEPEST:
@@ -172,6 +176,11 @@ def _value_problem(value: object, depth: int) -> str:
         return f"holds {value}, which is not a finite number; give another value, or leave it out"
     if isinstance(value, str) and _HALF.search(value):
         return f"holds {quoted(value)}, which is not Unicode text; write whole characters"
+    texts = [value, *value] if isinstance(value, dict) else [value]
+    if any(isinstance(text, str) and _CONTROL.search(text) for text in texts):
+        return f"holds {quoted(str(value))}, which no chart can write; leave out control characters"
+    if type(value) is int and abs(value) > _EXACT:
+        return f"holds {value}, which Helm rounds; give at most {_EXACT}, or a text"
     if isinstance(value, dict) and (long := [key for key in value if len(key) > _LONGEST_KEY]):
         length = f"{len(long[0])} characters, but at most {_LONGEST_KEY} are allowed"
         return f"has the key {quoted(long[0])} of {length}"
