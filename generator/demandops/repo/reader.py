@@ -14,6 +14,7 @@ from pygit2 import Commit, Oid, Tree
 
 from demandops.base import naming, settings
 from demandops.base.errors import BeforeTheFirst, InvalidInput, StateRepoError
+from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import with_lines
 from demandops.decide.state import FileReader, rendered_files
@@ -167,6 +168,12 @@ class Reader:
         since, until = self._sides(spec or "")
         if since is None:
             return [until]
+        if since not in ("", until) and not self.objects.descendant_of(until, since):
+            first, _, last = (spec or "").partition("..")
+            raise StateRepoError(
+                f"{quoted(first)} is not in the history of {quoted(last or 'main')}: if it was "
+                "there at an earlier audit, the history was rewritten since"
+            )
         walked = commit_log.commits(self.objects, until, since or None)
         return [entry.commit for _, entry in walked][::-1]
 

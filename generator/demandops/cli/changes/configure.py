@@ -29,7 +29,7 @@ from demandops.cli.target import all_names, names_of
 from demandops.decide.booking import Drain
 from demandops.decide.placement import relocation
 from demandops.decide.state import State
-from demandops.model.config.base_model import document, parse_file, parse_time, seconds_of
+from demandops.model.config.base_model import document, matches, parse_file, parse_time, seconds_of
 from demandops.model.config.config import NODES_FILE
 from demandops.model.config.discovered import is_discovered
 from demandops.model.config.entry_patterns import may_match
@@ -387,11 +387,21 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             if drained:
                 plan = relocation.with_moves(plan, after, after.usage(), after.names())
             lines = [*(f"moves: {text}" for text in plan.moved), *plan.stays]
+            lines += [] if drained else [*_kept_away(host, after)]
             data = {"node": host, "moved": [*plan.moved], "stays": [*plan.stays]}
             return data, (f"  {line}" for line in lines or ["moves nothing"])
 
         summary, branch = f"{verb} {host}", f"{verb.lower()}/{host}"
         person_change.commit(repo, {path: changed}, summary, branch, options, moves)
+
+
+def _kept_away(host: str, state: State) -> Iterator[str]:
+    # what an override moved away comes back with its end
+    for name, override in sorted(state.config.overrides.items()):
+        selected = any(matches(host, selector.nodes or ()) for selector in override.select)
+        if override.node not in (None, host) and selected and name not in state.ledger.ended:
+            end = shlex.join(["demandops", "override", "end", name])
+            yield f"{override.path} still moves it all to '{override.node}'; to end that: {end}"
 
 
 _node = click.argument("node", metavar="NODE", shell_complete=names_of("nodes"))

@@ -531,19 +531,23 @@ def origin_of(checkout: Path) -> str | None:
     return remotes.get("origin")
 
 
+# What keeps a hint about a checkout from being given, and is told by what needs it
+_UNREADABLE = (pygit2.GitError, OSError, KeyError, ValueError)
+
+
 def commits_behind(checkout: Path) -> int:
     """Return how many commits of its origin's main a checkout of main lacks.
 
     Main is as a fetch of the checkout, or a command on this machine, has left it.
     """
     lacking = [0]
-    with suppress(pygit2.GitError, KeyError, ValueError):
+    with suppress(*_UNREADABLE):
         repo, origin = Repository(str(checkout)), origin_of(checkout) or ""
         home = data_home(origin)
         clones = [*home.glob("*/clone.git"), *home.glob("reader/*/clone.git")]
         places = [(origin, MAIN), *((place, _REMOTE_MAIN) for place in (checkout, *clones))]
         for place, reference in places if repo.head.shorthand == MAIN_BRANCH else ():
-            with suppress(pygit2.GitError, KeyError, ValueError):  # a URL; not yet fetched
+            with suppress(*_UNREADABLE):  # a URL; not yet fetched
                 other = Repository(str(place))
                 tip = other.references[reference].target
                 lacking.append(other.ahead_behind(repo.head.target, tip)[1])
@@ -552,7 +556,7 @@ def commits_behind(checkout: Path) -> int:
 
 def changed_in(checkout: Path) -> list[str]:
     """Return the files of a checkout that are not like this on its origin's main."""
-    with suppress(pygit2.GitError, KeyError, ValueError):
+    with suppress(*_UNREADABLE):
         repo = Repository(str(checkout))
         main = repo.branches[f"origin/{MAIN_BRANCH}"].target
         committed = repo.diff(repo.merge_base(repo.head.target, main) or main, repo.head.target)

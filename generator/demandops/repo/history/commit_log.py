@@ -498,10 +498,12 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
             "commit, or check the repository with `git fsck`"
         ) from None
     if commit is None:
+        is_whole = re.fullmatch("[0-9a-f]{40}", text) is not None
         raise StateRepoError(
             f"{quoted(text)} is neither a commit of the state repo nor a time; write a branch, a "
             "tag or 4 to 40 digits of an id, with ~N for the Nth commit before it, or a time like "
             f"{TIMES}; `demandops log` lists the commits"
+            + ("; if an earlier audit named this id, the history was rewritten since" * is_whole)
         )
     return commit
 
