@@ -34,6 +34,8 @@ from demandops.model.config.inventory import (
 _CAPABILITY, _PROPERTY = "capability.demandops/", "property.demandops/"
 # Kubernetes counts pods like a resource, but no service requests them
 _UNREQUESTED = "pods"
+# Where a capacity lacks one of these, a node has as much as is asked for; of all others it has none
+_UNLIMITED = ("cpu", "memory")
 _ID, _WORD = TypeAdapter[str](DiscoveredId), TypeAdapter[str](Word)
 _NAME, _VALUE = TypeAdapter[str](PropertyName), TypeAdapter[object](PropertyValue)
 _RESOURCE, _AMOUNT = TypeAdapter[str](ResourceName), TypeAdapter[str](Quantity)
@@ -150,7 +152,7 @@ def _node(id: str, source: ClusterNode, how: Discovery, problems: list[str]) -> 
         if resource != _UNREQUESTED
         and _is_valid(_RESOURCE, resource)
         and _is_valid(_AMOUNT, amount)
-        and amount_of(amount)
+        and (amount_of(amount) or resource in _UNLIMITED)
     }
     return DiscoveredNode(
         id=id,

@@ -43,5 +43,7 @@ def check_chart(
     made = [manifest for manifest in yaml.safe_load_all(text) if manifest]
     for manifest in made:  # `helm template` may leave out the namespace, which an install adds
         manifest["metadata"].setdefault("namespace", namespace)
+        # rclpy refuses to unset a parameter, and with it all others
+        assert manifest["kind"] != "ConfigMap" or "null" not in str(manifest["data"])
     rig.kube.apply(*made, dry_run=True)
     return {manifest["kind"] for manifest in made}
