@@ -87,7 +87,6 @@ def kill_while_hanging(
     wait_until(
         lambda: not [pid for pid, start in left.items() if _stat(pid)[19:20] == [start]],
         "what the generator had started ended",
-        timeout=30,
     )
 
 
