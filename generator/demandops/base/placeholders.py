@@ -8,7 +8,7 @@ the structure of what it is put into.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -37,6 +37,16 @@ def texts(data: Any, path: str = "") -> Iterator[tuple[str, str]]:  # noqa: ANN4
     elif isinstance(data, list | tuple):
         for index, item in enumerate(data):
             yield from texts(item, f"{path}[{index}]")
+
+
+def unknown_names(
+    data: Any,  # noqa: ANN401 - plain data
+    path: str,
+    known: Container[str],
+) -> Iterator[tuple[str, str]]:
+    """Yield each placeholder that is none of ``known``, after the path where it stands."""
+    for place, text in texts(data, path):
+        yield from ((place, name) for name in names(text) if name not in known)
 
 
 def filled(data: Any, values: Mapping[str, Any]) -> Any:  # noqa: ANN401

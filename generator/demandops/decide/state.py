@@ -146,7 +146,7 @@ _MOST_NAMES = 5
 
 
 def effects_of(releases: Collection[ReleaseChange]) -> Iterator[str]:
-    """Yield a text for each effect, such as "reconfigures of-edge-fusion", for a receipt."""
+    """Yield what a receipt says of each effect, such as "reconfigures of-edge-fusion"."""
     for effect in get_args(Effect):
         names = [each.name for each in releases if effect and each.effect == effect]
         if names:

@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from demandops.base.errors import Fault, InvalidInput, fault, suggestion
 from demandops.base.naming import message_type_problem
-from demandops.base.placeholders import filled, names, texts, values_in
+from demandops.base.placeholders import filled, names, texts, unknown_names, values_in
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.base.strict_yaml import located_in
@@ -152,9 +152,7 @@ def faults_of_demand(
     known = {"rule", *subjects, *(momentary if template.action == "Demand" else ())}
     problems = [
         fault(path, f"'{{{name}}}' has no value here{suggestion(name, known)}")
-        for path, text in texts(template.data, field)
-        for name in names(text)
-        if name not in known
+        for path, name in unknown_names(template.data, field, known)
     ]
     if problems:
         return problems

@@ -27,7 +27,7 @@ from demandops.base.placeholders import (
     glob_of,
     is_pattern,
     names,
-    texts,
+    unknown_names,
     values_in,
 )
 from demandops.base.quoting import quoted
@@ -164,9 +164,7 @@ class EntryPattern(Generic[Entry]):
         listed = ", ".join(f"{{{name}}}" for name in known)
         faults = [
             fault(path, f"{{{name}}} is not in the id {quoted(self.id)}; write one of {listed}")
-            for path, text in texts(self.data, where)
-            for name in names(text)
-            if name not in known
+            for path, name in unknown_names(self.data, where, known)
         ]
         if faults:
             raise InvalidInput(each.within(self.file) for each in faults)
