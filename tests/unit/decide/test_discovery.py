@@ -1,5 +1,6 @@
 """What becomes of a cluster's file of discovered nodes, case by case."""
 
+import json
 from datetime import datetime, timezone
 from typing import Any
 
@@ -13,9 +14,9 @@ from demandops.model.config.load import load
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import configuration
-from tests.kit.plain_yaml import beside
+from tests.kit.config import configuration, edited, skeleton
 
 FROM_CLUSTER = """\
 apiVersion: demandops/v1
@@ -23,7 +24,8 @@ kind: Clusters
 clusters: [{name: c-its, nodes: from-cluster}]
 """
 NOW = datetime(2026, 5, 4, 12, tzinfo=timezone.utc)
-CASES = beside(__file__)
+POLICY = "policy/access-domains.yaml"
+CASES = plain_yaml.beside(__file__)
 
 
 def nodes(written: list[dict[str, Any]]) -> str:
@@ -94,6 +96,25 @@ def test_whatever_a_cluster_says_the_configuration_stays_valid(
         found = discover(cluster, seen, text, NOW, (), lambda id: False)
         text = found.text
         config = load(configuration({"inventory/clusters.yaml": FROM_CLUSTER, found.path: text}))
-        assert config.nodes["cloud"].type == "cloud", "as it is listed"
+        cloud = config.nodes["cloud"]
+        assert (cloud.type, cloud.drained) == ("cloud", False), "as it is listed"
         again = discover(cluster, seen, text, NOW, (), lambda id: False)
         assert (again.text, again.came, again.left, again.changed) == (text, (), (), ())
+
+
+def test_values_and_nodes_that_contradict_other_files_do_not_count() -> None:
+    sizes = {"bus1": 3, "bus2": "large", "bus3": "large"}
+    found = [{"id": id, "properties": {"size": size}} for id, size in sizes.items()]
+    file = nodes([*found, {"id": "bus9"}])
+    size = ("- id: cloud\n", "- id: cloud\n    properties: {size: 3}\n")
+    changed = edited("inventory/nodes.yaml", *size) | {"inventory/clusters.yaml": FROM_CLUSTER}
+    policy = plain_yaml.load(skeleton()[POLICY])
+    policy["domains"][0]["nodes"] = ["vehicle*", "station*", "edge", "cloud", "bus*"]
+    policy["domains"].append(
+        {"name": "b", "namespace": "b", "serviceAccount": "b", "nodes": ["*9"]}
+    )
+    changed |= {POLICY: json.dumps(policy), "inventory/discovered/c-its.yaml": file}
+    config = load(configuration(changed))
+    assert [config.nodes[id].properties for id in sizes] == [{"size": 3}, {}, {}]
+    assert "bus9" in config.nodes
+    assert "bus9" not in config.domain_of, "two access domains match it"
