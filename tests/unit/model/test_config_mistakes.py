@@ -16,7 +16,7 @@ from demandops.base.errors import Fault, InvalidInput
 from demandops.model.config.load import load
 
 from tests.kit import plain_yaml
-from tests.kit.config import configuration, edited, skeleton
+from tests.kit.config import configuration, skeleton
 
 ROOT, NODES = "demandops.yaml", "inventory/nodes.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
@@ -89,14 +89,3 @@ def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
 @pytest.mark.parametrize("name", _LISTED["valid"])
 def test_an_odd_but_valid_configuration_loads(name: str) -> None:
     load(configuration(changed(_LISTED["valid"][name])))
-
-
-def test_faults_of_one_place_come_in_the_order_of_their_names() -> None:
-    names = [f"role{number}" for number in range(9)]
-    uses = f"uses: {{driver: {{{', '.join(f'{name}: ego_data' for name in names)}}}}}\nservices:"
-    driver = Path(__file__).parents[2] / "appdefs" / "driver" / "service.yaml"
-    files = edited(APPDEF, "services:", uses) | {"appdefs/driver/service.yaml": driver.read_text()}
-    with pytest.raises(InvalidInput) as refused:
-        load(configuration(files))
-    fields = [fault.field for fault in refused.value.faults if "has no input" in fault.message]
-    assert fields == [f"uses.driver.{name}" for name in names]
