@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput
 from demandops.decide.discovery import ClusterNode, discover
 from demandops.model.config import discovered
 from demandops.model.config.discovered import DiscoveredNode
@@ -65,6 +66,14 @@ def test_what_was_written_is_what_is_read() -> None:
         assert discovered.text_of(discovered.read(text, "file")) == text
 
 
+def test_the_faults_of_an_edited_file_are_told_there() -> None:
+    path, text = "inventory/discovered/c-its.yaml", nodes([{"id": "bus0", "type": "bus"}])
+    edited = {"inventory/clusters.yaml": FROM_CLUSTER, path: text.replace("type: bus", "type: -x")}
+    with pytest.raises(InvalidInput) as error:
+        load(configuration(edited))
+    assert [(each.file, each.field) for each in error.value.faults] == [(path, "nodes[0].type")]
+
+
 odd = ["1", "true", "gpu", "0.5", "4Gi", "a..b", "é", "a b", "a/b", "a@b", "-a", "{n}", "x" * 64]
 anything = st.text(max_size=9) | st.sampled_from(odd)
 known = st.sampled_from(["demandops/type", "capability.demandops/gpu", "property.demandops/size"])
@@ -76,13 +85,9 @@ texts = st.dictionaries(keys, anything, max_size=5)
 def cluster_nodes(draw: st.DrawFn) -> list[ClusterNode]:
     ids = draw(st.lists(st.sampled_from(["bus0", "bus1", "cloud"]) | anything, max_size=4))
     return [
-        ClusterNode(name, {**draw(texts), "node_id": id}, draw(texts), draw(st.booleans()), {})
-        for name, id in enumerate_names(ids)
+        ClusterNode(f"m{n}", {**draw(texts), "node_id": id}, draw(texts), draw(st.booleans()), {})
+        for n, id in enumerate(ids)
     ]
-
-
-def enumerate_names(ids: list[str]) -> list[tuple[str, str]]:
-    return [(f"machine-{number}", id) for number, id in enumerate(ids)]
 
 
 @given(cluster_nodes(), cluster_nodes())
