@@ -10,7 +10,7 @@ import pytest
 from demandops.decide.planning.overrides import apply_effects, effects_on
 from demandops.decide.state import trial_releases
 from demandops.decide.warnings import tied_override_warnings
-from demandops.model.config.override import Override, OverrideFile
+from demandops.model.config.override import Override
 from demandops.model.release import ServiceRelease
 from demandops.templating.charts import merged, overridden
 from hypothesis import given
@@ -18,9 +18,11 @@ from hypothesis import strategies as st
 
 from tests.kit import plain_yaml
 from tests.kit.chance import examples
+from tests.kit.config import override_of
 from tests.kit.memory import MemoryRepo
 
 CONFIG = MemoryRepo().config
+ALL = {"nodes": ["*"]}
 
 json = st.recursive(
     st.none() | st.booleans() | st.integers(0, 2) | st.sampled_from("xy"),
@@ -87,7 +89,7 @@ def _release() -> ServiceRelease:
 def test_a_tie_is_told_where_the_order_of_names_decides(
     one: dict[str, Any], other: dict[str, Any]
 ) -> None:
-    both = [_override(name, fields) for name, fields in (("one", one), ("other", other))]
+    both = [override_of("one", ALL, **one), override_of("other", ALL, **other)]
     first, second = (_shaped(order) for order in (both, both[::-1]))
     told = [*tied_override_warnings([first])]
     assert bool(told) is bool([*tied_override_warnings([second])])
@@ -101,14 +103,8 @@ def test_a_tie_is_told_where_the_order_of_names_decides(
 def test_overrides_are_tied_if_they_differ_in_what_both_set(
     one: dict[str, Any], other: dict[str, Any], tied: bool
 ) -> None:
-    release = _shaped([_override("one", one), _override("other", other)])
+    release = _shaped([override_of("one", ALL, **one), override_of("other", ALL, **other)])
     assert bool([*tied_override_warnings([release])]) is tied
-
-
-def _override(name: str, fields: dict[str, Any]) -> Override:
-    head = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "r", "owner": "o"}
-    file = OverrideFile.model_validate(head | {"select": [{"nodes": ["*"]}]} | fields)
-    return Override.from_file(name, file)
 
 
 def _shaped(overrides: list[Override]) -> ServiceRelease:
