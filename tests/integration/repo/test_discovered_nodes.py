@@ -5,18 +5,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import pygit2
 import pytest
 from demandops.decide.checks.collisions import all_names
 from demandops.decide.checks.forbidden import whole_usage
 from demandops.decide.discovery import ClusterNode
 from demandops.decide.state import State
 from demandops.model.config.config import Config
+from demandops.repo.load.snapshot import follow
 from demandops.serve import node_discovery
 from demandops.serve.generator import Generator
 
 from tests.kit import plain_yaml, rig
 from tests.kit.clock import Clock
 from tests.kit.goals import put
+from tests.kit.memory import NOW
 from tests.kit.repo import GitRepo, Person, assert_sound, commits, git, read
 
 FILE = "inventory/discovered/c-its.yaml"
@@ -189,13 +192,20 @@ def test_people_cannot_edit_what_a_cluster_says(
     cluster.add("bus0", "bus1")
     cluster.look()
     text = read(bare, FILE)
-    person.change({FILE: text.replace("bus0", "tram0"), "inventory/discovered/x.yaml": "odd"})
-    cluster.generator.fetch_now()
-    rig.wait_until(lambda: cluster.operations[-1] == "follow", "the edit is put back")
-    assert read(bare, FILE) == text
-    assert "tram0" not in cluster.state.config.nodes
-    assert "inventory/discovered/x.yaml" not in GitRepo(bare).files()
-    assert cluster.generator.snapshot.faults == ()
+    objects = pygit2.Repository(bare)
+    for edited in (text.replace("bus0", "tram0"), "odd"):
+        seen = cluster.generator.snapshot
+        # who only reads sees none of it, not even after a second commit
+        for path in (FILE, "inventory/discovered/x.yaml"):
+            commit = pygit2.Oid(hex=person.change({path: edited}))
+            seen = follow(objects, seen, commit, NOW).snapshot
+            assert {"bus0", "tram0"} & {*seen.state.config.nodes} == {"bus0"}
+        cluster.generator.fetch_now()
+        rig.wait_until(lambda: cluster.operations[-1] == "follow", "the edit is put back")
+        assert f"Put back, because not valid:\n  {FILE}: is written only by" in cluster.newest
+        assert read(bare, FILE) == text
+        assert "inventory/discovered/x.yaml" not in GitRepo(bare).files()
+        assert cluster.generator.snapshot.faults == ()
     assert_sound(bare, verify_last=4)
 
 
