@@ -244,10 +244,8 @@ DNS_1123 = re.compile(r"[a-z0-9]([-a-z0-9]*[a-z0-9])?")
 ROS_NODE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 LONGEST_NAME = 53
 
-Subject = tuple[str, ...]
-"""What a name is made from: a prefix, and ids or topics."""
-COUNTS = {"od": (2, 3), "of": (1,), "mqtt": (2,)}
-"""How many ids the program puts behind a prefix."""
+Subject = tuple[str, ...]  # what a name is made from: a prefix, and ids or topics
+COUNTS = {"od": (2, 3), "of": (1,), "mqtt": (2,)}  # how many ids are behind a prefix
 
 close = st.text("ab0-_/.A", min_size=1, max_size=5)
 hashed = st.builds(
