@@ -84,11 +84,30 @@ def test_every_value_that_does_not_fit_the_charts_schema_is_told() -> None:
     assert places == ["values.hostNetwork", "values.replicas"]
 
 
-def test_a_value_that_comes_from_a_parameter_names_it() -> None:
-    text = skeleton()[APPDEF].replace("\nservices:", "\nparameters: {net: {default: x}}\nservices:")
-    template = skeleton()[TEMPLATE].replace("{{ node.host_network }}", "{{ parameters.net }}")
-    (found,) = refused({TEMPLATE: template, APPDEF: text})
-    assert found.endswith(f"{CHART}, or demand another value of the parameter net")
+def with_parameters(value: object) -> dict[str, str]:
+    """Return files in which a node gets its ROS parameters from the parameter `net`."""
+    net = json.dumps({"net": {"default": value}})
+    text = skeleton()[APPDEF].replace("\nservices:", f"\nparameters: {net}\nservices:")
+    template = skeleton()[TEMPLATE] + "parameters:\n  node: {{ parameters.net }}\n"
+    return {APPDEF: text, TEMPLATE: template}
+
+
+@pytest.mark.parametrize(("value", "place", "told"), LISTED["ros parameters"]["refused"])
+def test_what_ros_cannot_carry_is_refused_with_the_parameter_that_it_comes_from(
+    value: object, place: str, told: str
+) -> None:
+    (found,) = refused(with_parameters(value))
+    assert found.startswith(f"{TEMPLATE}:{LAST + 1}: values.parameters.node.{place}: ")
+    assert told in found
+    assert found.endswith(", or demand another value of the parameter net")
+
+
+def test_numbers_keep_their_type_on_the_way_through_json() -> None:
+    given, written = LISTED["ros parameters"]["taken"]
+    books = MemoryRepo(with_parameters(given))
+    books.send(perception())
+    release = books.objects("HelmRelease")["od-edge-vehicle00"]
+    assert release["spec"]["values"]["parameters"] == {"node": written}
 
 
 @pytest.mark.parametrize(("text", "above", "word"), LISTED["topics"])
