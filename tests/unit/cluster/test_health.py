@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from operator import itemgetter
 from typing import Any
 
@@ -41,42 +42,33 @@ SOURCE = ("GitRepository", "ns", "demandops")
 HELM = ("HelmRelease", "ns", "od-edge")
 
 
-def kustomization(applied: str = "", attempted: str = "", *conditions: Any) -> dict[str, Any]:
-    status = {"lastAppliedRevision": applied and f"main@sha1:{applied}"}
+def kustomization(applied: str, attempted: str, conditions: Iterable[Any] = ()) -> dict[str, Any]:
+    status: dict[str, Any] = {"lastAppliedRevision": applied and f"main@sha1:{applied}"}
     status["lastAttemptedRevision"] = attempted and f"main@sha1:{attempted}"
-    spec = {"sourceRef": {"name": "demandops"}}
-    return {"metadata": {}, "spec": spec, "status": status | {"conditions": list(conditions)}}
+    status["conditions"] = [condition(*one) for one in conditions]
+    return {"metadata": {}, "spec": {"sourceRef": {"name": "demandops"}}, "status": status}
 
 
-def release(*conditions: Any, observed: int = 2) -> dict[str, Any]:
-    status = {"observedGeneration": observed, "conditions": list(conditions)}
+def release(conditions: Iterable[Any] = (), observed: int = 2) -> dict[str, Any]:
+    listed = [condition(*one) for one in conditions]
+    status = {"observedGeneration": observed, "conditions": listed}
     return {"metadata": {"generation": 2}, "status": status}
 
 
 @pytest.mark.parametrize("case", FLUX_CASES["domain"], ids=itemgetter("when"))
 def test_an_access_domain_is_as_far_as_its_kustomization(case: Case) -> None:
-    objects: dict[tuple[str, str, str], Any] = {}
-    if "over" in case:
-        over = case["over"]
-        conditions = [condition(*one) for one in over.get("conditions", ())]
-        objects[OVER] = kustomization(over["applied"], over["attempted"], *conditions)
+    objects = {OVER: kustomization(**case["over"])} if "over" in case else {}
     if "source" in case:
         conditions = [condition(*one) for one in case["source"]]
         objects[SOURCE] = {"metadata": {}, "status": {"conditions": conditions}}
-    health = FLUX.domain_health(PLACE, "b", objects, COMMITS)
-    assert told(health, case) == case
+    assert told(FLUX.domain_health(PLACE, "b", objects, COMMITS), case) == case
 
 
 @pytest.mark.parametrize("case", FLUX_CASES["release"], ids=itemgetter("when"))
 def test_a_release_is_healthy_when_helm_and_all_its_deployments_are(case: Case) -> None:
-    objects = deployments(case)
-    if "helm" in case:
-        conditions = [condition(*one) for one in case["helm"].get("conditions", ())]
-        objects[HELM] = release(*conditions, observed=case["helm"].get("observed", 2))
-    health = FLUX.release_health(
-        targets_in(PLACE)[case.get("of", "service")], "b", objects, COMMITS
-    )
-    assert told(health, case) == case
+    objects = deployments(case) | ({HELM: release(**case["helm"])} if "helm" in case else {})
+    target = targets_in(PLACE)[case.get("of", "service")]
+    assert told(FLUX.release_health(target, "b", objects, COMMITS), case) == case
 
 
 def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
@@ -87,7 +79,7 @@ def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
 
 
 def test_since_when_is_the_cluster_s_to_say() -> None:
-    found = {HELM: release(condition("Ready", "True"))}
+    found = {HELM: release([("Ready", "True")])}
     service, client, _ = targets_in(PLACE).values()
     assert FLUX.last_transition(service, found) == "2026-05-04T12:00:00Z"
     assert FLUX.last_transition(client, found) == ""
@@ -113,13 +105,13 @@ def test_a_domain_is_idle_once_the_last_fetch_is_applied(case: Case) -> None:
             "status": {"artifact": artifact, "lastHandledReconcileAt": handled},
         }
         applied, attempted, ready = case["applies"]
-        objects[OVER] = kustomization(applied, attempted, condition("Ready", ready))
+        objects[OVER] = kustomization(applied, attempted, [("Ready", ready)])
     assert Flux().is_idle(PLACE, objects, before="1") is case["idle"]
 
 
 def test_a_domain_that_was_never_asked_to_fetch_is_idle() -> None:
     never = {"metadata": {}, "status": {"artifact": {"revision": "main@sha1:a"}}}
-    objects = {SOURCE: never, OVER: kustomization("a", "a", condition("Ready", "True", "applied"))}
+    objects = {SOURCE: never, OVER: kustomization("a", "a", [("Ready", "True", "applied")])}
     assert Flux().is_idle(PLACE, objects, before=None)
     assert Flux().handled_request(PLACE, objects) == ""
 
@@ -159,64 +151,38 @@ SOURCES: dict[str, dict[str, Any]] = {
 }
 
 
-def application(
-    wanted: dict[str, Any],
-    *,
-    sync: str = "",
-    at: str = "",
-    compared: dict[str, Any] | None = None,
-    operation: dict[str, Any] | None = None,
-    conditions: tuple[dict[str, str], ...] = (),
-    health: str = "Healthy",
-    resources: tuple[dict[str, str], ...] = (),
-) -> dict[str, Any]:
-    """Return an Application with the source ``wanted``, which was compared if ``sync`` is set."""
-    status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
-    status["health"] = {"status": health, "lastTransitionTime": AT}
-    if sync:
-        against = {"source": wanted if compared is None else compared}
-        status["sync"] = {"status": sync, "revision": at, "comparedTo": against}
-    if operation:
-        status["operationState"] = operation
-    return {"metadata": {"name": "x"}, "spec": {"source": wanted}, "status": status}
+def application(default: str, **fields: Any) -> dict[str, Any]:
+    """Return the Application that a case describes; it was compared if ``sync`` is set."""
+    source = fields.get("source", default)
+    wanted, names = SOURCES[source], fields.get("resources", ())
+    named = {"group": "apps", "kind": "Deployment", "namespace": "ns"}
+    status: dict[str, Any] = {
+        "conditions": [condition(kind, "", text) for kind, text in fields.get("conditions", ())],
+        "resources": [named | {"name": name} for name in names],
+        "health": {"status": fields.get("health", "Healthy"), "lastTransitionTime": AT},
+    }
+    if "sync" in fields:
+        against = {"source": SOURCES[fields.get("compared", source)]}
+        status["sync"] = {"status": fields["sync"], "revision": fields.get("at", "")}
+        status["sync"]["comparedTo"] = against
+    if "operation" in fields:
+        status["operationState"] = synced(**{"of": default} | fields["operation"])
+    deleted = {"deletionTimestamp": AT} if fields.get("deleted") else {}
+    return {"metadata": {"name": "x"} | deleted, "spec": {"source": wanted}, "status": status}
 
 
-def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
-    """Return the ``operationState`` of a sync from the source ``of``, by default the folder."""
-    result = {"revision": revision, "source": more.pop("of", FOLDER)}
-    result["resources"] = more.pop("resources", [])
+def synced(phase: str, revision: str, of: str, message: str = "", **more: Any) -> dict[str, Any]:
+    """Return the ``operationState`` of a sync from the source ``of``."""
+    result = {"revision": revision, "source": SOURCES[of], "resources": more.pop("resources", [])}
     asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}
     return {
         "phase": phase, "message": message, "syncResult": result, "operation": asked, **more
     }  # fmt: skip
 
 
-def described(default: str, fields: dict[str, Any]) -> dict[str, Any]:
-    """Return the Application that a case describes."""
-    fields, wanted = {**fields}, SOURCES[fields.get("source", default)]
-    fields.pop("source", None)
-    is_deleted = fields.pop("deleted", False)
-    if "compared" in fields:
-        fields["compared"] = SOURCES[fields["compared"]]
-    if "operation" in fields:
-        operation = {**fields["operation"]}
-        operation["of"] = SOURCES[operation.get("of", default)]
-        fields["operation"] = synced(**operation)
-    fields["conditions"] = [
-        condition(kind, "", text) for kind, text in fields.get("conditions", ())
-    ]
-    fields["resources"] = [
-        {"group": "apps", "kind": "Deployment", "namespace": "ns", "name": name}
-        for name in fields.get("resources", ())
-    ]
-    made = application(wanted, **fields)
-    made["metadata"] |= {"deletionTimestamp": AT} if is_deleted else {}
-    return made
-
-
 @pytest.mark.parametrize("case", ARGOCD_CASES["domain"], ids=itemgetter("when"))
 def test_an_access_domain_is_as_far_as_the_application_over_its_folder(case: Case) -> None:
-    objects = {APPLICATION: described("folder", case["over"])} if "over" in case else {}
+    objects = {APPLICATION: application("folder", **case["over"])} if "over" in case else {}
     health = ARGOCD.domain_health(IN_ARGOCD, "b", objects, COMMITS)
     assert told(health, case) == case
     assert health.object in ("", "Application argocd/demandops-perception")
@@ -226,9 +192,9 @@ def test_an_access_domain_is_as_far_as_the_application_over_its_folder(case: Cas
 def test_a_release_is_healthy_when_it_is_synced_as_it_stands_now_and_all_is_there(
     case: Case,
 ) -> None:
-    objects = {APPLICATION: application(FOLDER, sync="Synced", at="b"), **deployments(case)}
+    objects = {APPLICATION: application("folder", sync="Synced", at="b"), **deployments(case)}
     if "child" in case:
-        objects[CHILD] = described("new", case["child"])
+        objects[CHILD] = application("new", **case["child"])
     history = Letters([case["changing"]] if "changing" in case else [])
     health = ARGOCD.release_health(
         targets_in(IN_ARGOCD)[case.get("of", "service")], "b", objects, history
@@ -237,18 +203,15 @@ def test_a_release_is_healthy_when_it_is_synced_as_it_stands_now_and_all_is_ther
 
 
 def test_applied_commit_and_last_transition_come_from_the_applications_in_the_cluster() -> None:
-    objects = {
-        APPLICATION: application(FOLDER, sync="Synced", at="b"),
-        CHILD: application(source()),
-    }
-    assert ARGOCD.applied_commit(IN_ARGOCD, objects) == "b"
+    over, child = application("folder", sync="Synced", at="b"), application("new")
+    succeeded = {"phase": "Succeeded", "revision": "b"}
+    under_way = application("folder", sync="OutOfSync", at="c", operation=succeeded)
+    assert ARGOCD.applied_commit(IN_ARGOCD, {APPLICATION: over}) == "b"
     assert ARGOCD.applied_commit(IN_ARGOCD, {}) == ""
-    succeeded = synced("Succeeded", "b")
-    under_way = application(FOLDER, sync="OutOfSync", at="c", operation=succeeded)
     assert ARGOCD.applied_commit(IN_ARGOCD, {APPLICATION: under_way}) == "b"
     service, client, _ = targets_in(IN_ARGOCD).values()
-    assert ARGOCD.last_transition(service, objects) == AT
-    assert ARGOCD.last_transition(client, objects) == ""
+    assert ARGOCD.last_transition(service, {CHILD: child}) == AT
+    assert ARGOCD.last_transition(client, {CHILD: child}) == ""
 
 
 def test_only_one_object_of_argo_cds_namespace_is_read() -> None:
