@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
-import subprocess
 import sys
 import sysconfig
 from collections.abc import Callable
@@ -15,6 +14,8 @@ from types import ModuleType
 import pytest
 
 from tests.kit import plain_yaml
+from tests.kit.cli import process
+from tests.kit.repo import program
 
 INTERFACES = Path(__file__).resolve().parents[2] / "ros_bridge" / "interfaces"
 BUILD = INTERFACES / "build.py"
@@ -25,9 +26,8 @@ FOLDERS = Path(__file__).resolve().parents[1] / "fixtures" / "messages"
 
 def test_nothing_changed_is_seen_without_a_compiler() -> None:
     for environment in (os.environ, {"PATH": ""}):
-        command = [sys.executable, str(BUILD)]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == (f"interfaces: up to date in {sys.prefix}\n", "")
+        ran = process(sys.executable, BUILD, env=environment)
+        assert ran == (0, f"interfaces: up to date in {sys.prefix}\n", "")
 
 
 FAKE_CMAKE = Path(__file__).with_name("fake-cmake.sh").read_text()
@@ -58,10 +58,8 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     for wheel in module.WHEELS:
         (prefix / "site" / f"{wheel}-1.0.dist-info").mkdir(parents=True)
 
-    tools.mkdir()
     for tool in ("cmake", "ninja", "cc", "c++"):
-        (tools / tool).write_text(FAKE_CMAKE.replace("PREFIX", str(prefix)))
-        (tools / tool).chmod(0o755)
+        program(tools / tool, FAKE_CMAKE.replace("PREFIX", str(prefix)))
     monkeypatch.setenv("PATH", str(tools))
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.delenv("CXX", raising=False)

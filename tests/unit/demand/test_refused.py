@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unicodedata import category
@@ -24,7 +23,7 @@ from hypothesis import strategies as st
 from tests.kit.chance import examples
 from tests.kit.goals import APP, CLOUD, Goal, application, connection, goal, put
 from tests.kit.memory import NOW, MemoryRepo
-from tests.unit.decide.test_budget import counted, repo
+from tests.unit.decide.test_budget import counted
 
 
 def _made(make: Callable[..., Any], written: Any) -> Any:
@@ -70,9 +69,6 @@ def test_a_demand_that_lists_too_much_is_refused_at_once() -> None:
     (found,) = faults(MemoryRepo(), goal([application(clouds=clouds)]))
     assert (found.field, found.code) == ("id", "too-large")
     assert "limits.demandItems" in found.message
-    item = goal([], [connection(topics=["/a", "/b"])])
-    assert repo(demandItems=4).send(item).outcome == "booked"
-    assert len(faults(repo(demandItems=3), item)) == 1
 
 
 @pytest.mark.parametrize("key", ["k{}".format, int])
@@ -87,18 +83,6 @@ def test_of_many_faults_of_form_the_first_are_told() -> None:
     found = faults(MemoryRepo(), put("d") | {"applications": [fields] * 2})
     assert len(found) == MOST_FAULTS
     assert "applications[0].k0" in {one.field for one in found}
-
-
-def test_a_file_that_would_grow_too_large_is_refused_and_may_shrink() -> None:
-    topics = [f"/topic_{i}" for i in range(30)]
-    found = faults(repo(fileBytes=1000), goal([], [connection(topics=topics)]))
-    assert {one.file.split("/")[0] for one in found} == {"clusters"}
-    assert all("at most 1000 are allowed" in one.message for one in found)
-    before = MemoryRepo()
-    before.send(goal([], [connection(topics=topics)]))
-    small = repo(fileBytes=1000)
-    small.state, small.files = replace(small.state, ledger=before.state.ledger), before.files
-    small.send(goal([], [connection(topics=topics[:1])], shutdown=True))
 
 
 def test_parameters_are_bounded() -> None:

@@ -15,6 +15,7 @@ from demandops.detect.rule_file import POSITIONS
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.detection import POSE, rule, text_of
 
@@ -85,17 +86,7 @@ def test_a_message_of_no_use_is_left_out(sent: Message, why: str) -> None:
     assert str(caught.value).startswith(why)
 
 
-@pytest.mark.parametrize(
-    ("pattern", "topic", "entity"),
-    [
-        ("/cars/{entity}/pose", "/cars/car7/pose", "car7"),
-        ("/cars/{entity}/pose", "/cars/a/b/pose", None),
-        ("/car_{entity}", "/car_7", "7"),
-        ("/cars/{entity}/pose", "/cars/car7/pose2", None),
-        ("/poses", "/poses", ""),
-        ("/poses", "/poses2", None),
-    ],
-)
+@pytest.mark.parametrize(("pattern", "topic", "entity"), plain_yaml.beside(__file__))
 def test_an_entity_is_one_part_of_a_topic(pattern: str, topic: str, entity: str | None) -> None:
     assert entity_in(pattern, topic) == entity
 

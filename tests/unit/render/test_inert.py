@@ -175,11 +175,6 @@ def test_a_number_that_json_lacks_is_not_written_as_text(number: float) -> None:
         strict_yaml.to_json({"a": [number]})
 
 
-@pytest.mark.parametrize("text", UNSEEN[1:])
-def test_what_no_reader_would_see_is_refused_in_an_id(text: str) -> None:
-    assert MemoryRepo().faults(goal([], [connection(f"a{text.strip('ab ')}b")]))
-
-
 @pytest.mark.parametrize(
     "value",
     ["!!binary aGk=", "!!set {x}", "!!omap [x: 1]", "!!int x", ".inf"],

@@ -57,14 +57,7 @@ def commit_of(repo: pygit2.Repository, text: str) -> pygit2.Commit:
     return commit_log.resolve(repo, tip, text, NOW)
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("9:59:59", "at 2026-01-31 09:59:59 UTC the state repo did not exist yet; its first commit "
-         "is of 2026-01-31 10:00:00 UTC"),
-        ("domain", "'domain' is neither a commit of the state repo nor a time; write a branch"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "told"), TABLES["neither"])
 def test_neither_revision_nor_a_time_of_the_state_repo(
     repo: pygit2.Repository, text: str, told: str
 ) -> None:
@@ -78,22 +71,11 @@ def named(repo: pygit2.Repository) -> dict[str, str]:
     """Names and ids in a repository with more than one branch, as name → whole id."""
     tip, middle, first = (str(commit.id) for commit in repo.walk(repo.references[MAIN].target))
     tag = repo.create_tag("annotated", pygit2.Oid(hex=first), ObjectType.COMMIT, WHO, "a tag")
-    for name, commit in {
-        "refs/tags/plain": middle,
-        "refs/tags/2026-01-30": middle,
-        "refs/heads/demand/a-b": first,
-        "refs/heads/\u00e9": middle,
-        "refs/remotes/origin/tracked": first,
-        "refs/heads/-x": first,
-        f"refs/heads/{tip}": first,
-        f"refs/heads/{middle[:9]}": first,
-        "refs/heads/twice": first,
-        "refs/tags/twice": tip,
-        "refs/stash": first,
-    }.items():
-        repo.references.create(name, pygit2.Oid(hex=commit))
+    ids = {"tip": tip, "middle": middle, "first": first, "tag": str(tag)}
+    for name, commit in TABLES["references"].items():
+        repo.references.create(name.format_map(ids), pygit2.Oid(hex=ids[commit]))
     repo.references.create("refs/tags/folder", repo.TreeBuilder().write())
-    return {"tip": tip, "middle": middle, "first": first, "tag": str(tag)}
+    return ids
 
 
 @pytest.mark.parametrize(
