@@ -125,9 +125,18 @@ def test_folders_of_messages_are_built_after_what_they_need_and_kept(
     built = [line.split()[1] for line in capsys.readouterr().out.splitlines()[-8:]]
     assert built == ["fleet_msgs:"] * 4 + ["hazard_msgs:"] * 4
     (given / "fleet_msgs" / "msg" / "Motion.msg").write_text("float64[] state\n")
-    for folders, made in (((), 0), ((str(given / "fleet_msgs"),), 2), ((), 0)):
-        assert script.main(*folders) == 0
+    (given / "again").symlink_to("fleet_msgs")
+    for folders, made in (((), 0), (("fleet_msgs", "fleet_msgs", "again"), 2), ((), 0)):
+        assert script.main(*(str(given / name) for name in folders)) == 0
         assert calls(script) == ["configure", *MADE] * made
+    (given / "fleet_msgs" / "msg" / "Lost.msg").symlink_to("nowhere")
+    assert script.main(str(given)) == 1
+    # without what it needs, a kept package fails no build
+    (script.KEPT / "fleet_msgs" / "msg" / "Report.msg").unlink()
+    (script.SITE / "ros_rclpy-1.0.dist-info").rename(script.SITE / "ros_rclpy-2.dist-info")
+    assert script.main() == 0
+    assert "hazard_msgs: needs fleet_msgs/Report, which" in capsys.readouterr().err
+    assert calls(script) == [*ALL, "configure", *MADE]
 
 
 @pytest.mark.parametrize(("files", "told"), TOOLS["refused"].values(), ids=TOOLS["refused"])
