@@ -68,6 +68,7 @@ class History:
     def __init__(self, world: World) -> None:
         self.world, self.oracle = world, Oracle(world)
         self.chance, self.turns = world.turns.chance, world.turns
+        self.repo = GitRepo(Path(world.remote.path))
         self._maker = DemandMaker(self.chance, WORDS)
         self._shutdowns: list[Goal] = []
         self._latest = 0.0
@@ -290,15 +291,12 @@ class History:
 
     def _commit(self, changed: dict[str, str | None]) -> str:
         who = ("Petra Platform", "petra@example.org", int(self.turns.now().timestamp()))
-        return GitRepo(Path(self.world.remote.path)).commit(changed, "By hand\n", who)
-
-    def _files(self, under: str) -> dict[str, str]:
-        return GitRepo(Path(self.world.remote.path)).files(under)
+        return self.repo.commit(changed, "By hand\n", who)
 
     def _override(self) -> None:
         name = self.chance.choice(sorted(_OVERRIDES))
         path = f"overrides/{name}.yaml"
-        if path in self._files("overrides/") and self.chance.randrange(2):
+        if path in self.repo.files("overrides/") and self.chance.randrange(2):
             self._commit({path: None})
             return
         head = {"apiVersion": "demandops/v1", "kind": "Override"}
@@ -310,16 +308,15 @@ class History:
 
     def _changed(self, path: str, change: Callable[[Any], object]) -> str:
         """Commit a change of a file's data; return the commit's id."""
-        data = plain_yaml.load(self._files(path)[path])
+        data = plain_yaml.load(self.repo.files(path)[path])
         change(data)
         return self._commit({path: plain_yaml.dump(data)})
 
     def _inventory(self) -> None:
-        def add(data: Any) -> None:
-            car = {"id": f"car{len(data['nodes'])}", "type": "vehicle", "cluster": "c-its"}
-            data["nodes"].append(car)
-
-        self._changed(NODES, add)
+        car = {"type": "vehicle", "cluster": "c-its"}
+        self._changed(
+            NODES, lambda data: data["nodes"].append(car | {"id": f"car{len(data['nodes'])}"})
+        )
 
     def _drain(self) -> None:
         self.oracle.check()
@@ -328,16 +325,15 @@ class History:
         name = self.chance.choice(used or sorted(PLACES))
         drained = name not in books.drained
 
-        def drain(data: Any) -> None:
-            (node,) = (one for one in data["nodes"] if one["id"] == name)
-            node["drained"] = drained
-
-        commit = self._changed(NODES, drain)
+        commit = self._changed(
+            NODES,
+            lambda data: [o.update(drained=drained) for o in data["nodes"] if o["id"] == name],
+        )
         self.oracle.edits[commit] = lambda books: books.drain(name, drained)
 
     def _stop_waiting(self) -> None:
         self.oracle.check()
-        if found := sorted(self._files("ledger/waiting").items()):
+        if found := sorted(self.repo.files("ledger/waiting").items()):
             path, text = self.chance.choice(found)
             demand = plain_yaml.load(text)["goal"]["demand"]
             self.oracle.edits[self._commit({path: None})] = lambda books: books.waiting.pop(demand)
@@ -359,8 +355,7 @@ class History:
             self.oracle.edits[self._commit({path: None})] = lambda books: books.drop([gone])
 
     def _edit_generated(self) -> None:
-        found = sorted(path for path in self._files("clusters/") if path.endswith(".yaml"))
-        path = self.chance.choice(found)
+        path = self.chance.choice(sorted(self.repo.manifests()))
         self._commit({path: self.chance.choice([None, "hand: made\n"])})
 
     def _branches(self) -> list[str]:
