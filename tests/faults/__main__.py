@@ -19,7 +19,7 @@ import traceback
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from multiprocessing import current_process, get_context
 from pathlib import Path
@@ -68,8 +68,7 @@ def main() -> int:
                 seconds = time.monotonic() - began
                 for result in found:
                     for problem in result.problems:
-                        where = " ".join(result.where)
-                        print(f"VIOLATED {result.part} {where} {result.fault}: {problem}")
+                        print(f"VIOLATED {' '.join(result.where)} {result.fault}: {problem}")
                 if seconds - told >= TELL_EVERY_S:
                     told = seconds
                     left = seconds / number * (len(tasks) - number)
@@ -112,7 +111,7 @@ def _tasks(folder: Path, long: bool) -> Iterator[_Task]:
         if not remote:
             yield from (_Task("failed sync", False, (each.n,)) for each in syncs if each.n > 1)
         for job in injection.jobs(sites, remote=remote, short=not long):
-            yield _Task("injection", remote, (job,))
+            yield _Task("injection", remote, job)
 
 
 def _start(folder: Path, short: bool) -> None:
@@ -121,11 +120,12 @@ def _start(folder: Path, short: bool) -> None:
 
 
 def _run(task: _Task) -> list[Result]:
+    part = f"{task.part}, remote:" if task.remote else f"{task.part}:"
     try:
-        return _results(task)
+        return [replace(each, where=(part, *each.where)) for each in _results(task)]
     except Exception as error:  # the other tasks' results must not be lost
         traceback.print_exc()
-        return [Result(task.part, (str(task.what), "", ""), "", (f"not tried: {error!r}",))]
+        return [Result((part, str(task.what)), "", (f"not tried: {error!r}",))]
 
 
 def _results(task: _Task) -> list[Result]:
@@ -153,7 +153,7 @@ def _report(results: list[Result], seconds: float) -> None:
     for result in results:
         known = [f"known and open: {problem}" for problem in result.known]
         verdicts = [*result.problems, *known] or ["sound"]
-        by_class.setdefault(" ".join((result.part, *result.where)), Counter()).update(verdicts)
+        by_class.setdefault(" ".join(result.where), Counter()).update(verdicts)
     OUT.parent.mkdir(exist_ok=True)
     in_all = json.loads(OUT.read_text()) if OUT.exists() else {}  # the file counts all runs
     for name, verdicts in sorted(by_class.items()):

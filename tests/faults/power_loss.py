@@ -16,7 +16,7 @@ from pathlib import Path
 from tests.faults.injection import SYNCS, Result
 from tests.faults.invariants import DEMAND, after_restart
 from tests.faults.rig import Ran, Rig, Strace
-from tests.faults.trace import Call, file_class, parse
+from tests.faults.trace import Call
 
 _TRACE = ("-f", "-s", "16000000", "-e", "trace=%file,%desc,%process")
 _FOLDER = -1
@@ -87,7 +87,7 @@ class Disk:
         elif not call.failed:
             parts = list(self._parts(call, path))
             if parts:
-                change = _Change(f"{call.kind} {file_class(path, self.root)}", parts)
+                change = _Change(f"{call.kind} {call.file}", parts)
                 if self._always_safe and path.startswith(self._always_safe):
                     change.safe = set(range(len(parts)))
                 self._append(change)
@@ -205,22 +205,16 @@ def run(rig: Rig) -> Iterator[Result]:
     rig.restore()
     disk = Disk(rig.folder, always_safe=str(rig.state) if rig.remote else "")
     ran = rig.must(rig.book(DEMAND, Strace(_TRACE)))
-    calls = parse(ran.trace, ran.roles, rig.folder)
-    unanswered = Ran(0, "", "")
-    seen: set[tuple[tuple[str, int], ...]] = set()
-    number = 0
-    for call in calls:
+    seen, number = set[object](), 0
+    for call in ran.calls:
         if call.kind in SYNCS:
             number += 1
-            title = f"at sync {number}, {file_class(call.paths[-1], rig.folder)}"
-            yield from _lose(rig, disk, title, unanswered, seen)
+            yield from _lose(rig, disk, f"at sync {number}, {call.file}", Ran(0, "", ""), seen)
         disk.follow(call)
     yield from _lose(rig, disk, "at the answer", ran, seen)
 
 
-def _lose(
-    rig: Rig, disk: Disk, when: str, ran: Ran, seen: set[tuple[tuple[str, int], ...]]
-) -> Iterator[Result]:
+def _lose(rig: Rig, disk: Disk, when: str, ran: Ran, seen: set[object]) -> Iterator[Result]:
     for title, missing in disk.states():
         disk.write(missing)
         files = sorted(path for path in rig.folder.rglob("*") if path.is_file())
@@ -228,10 +222,9 @@ def _lose(
         if state in seen:
             continue
         seen.add(state)
-        part = "power loss, remote" if rig.remote else "power loss"
         if rig.remote:  # the server lost no power, so it leaves no locks
             rig.unlock_server()
-        yield Result(part, (when, title, ""), "", tuple(after_restart(rig, ran)))
+        yield Result((when, title), "", tuple(after_restart(rig, ran)))
 
 
 def failed_sync(rig: Rig, number: int) -> Result:
@@ -246,12 +239,11 @@ def failed_sync(rig: Rig, number: int) -> Result:
     again = rig.must(rig.book(0, Strace(_TRACE)))  # demand 0 is booked already
     files = set()
     for ran in (first, again):
-        for call in parse(ran.trace, ran.roles, rig.folder):
+        for call in ran.calls:
             disk.follow(call)
             if "INJECTED" in call.result:
-                files.add(file_class(call.paths[-1], rig.folder))
+                files.add(call.file)
     unsafe = [change for change in disk.changes if not change.is_safe]
     disk.write(unsafe)
-    where = (f"after a failed sync of {', '.join(files)} and a restart", "", "")
     problems = tuple(after_restart(rig, again, journaled=True))
-    return Result("power loss", where, "EIO", problems)
+    return Result((*files, "and a restart"), "EIO", problems)

@@ -16,7 +16,7 @@ from contextlib import nullcontext, redirect_stderr
 from io import StringIO
 from multiprocessing import get_context
 from pathlib import Path
-from random import Random, SystemRandom
+from random import SystemRandom
 from typing import Any
 
 from hypothesis import HealthCheck, Phase, given, settings
@@ -157,16 +157,14 @@ def _is_ours(file: str) -> bool:
 
 
 def changed(seeds: tuple[bytes, ...]) -> st.SearchStrategy[bytes]:
-    def change(seed: bytes, random: Random) -> bytes:
-        data = bytearray(seed)
-        for _ in range(random.randrange(1, 6)):
-            first = random.randrange(len(data) + 1)
-            last = min(len(data), first + random.randrange(12))
-            part = bytes(data[first:last])
-            data[first:last] = random.choice([b"", part * 2, random.randbytes(len(part) or 1)])
-        return bytes(data)
+    def change(seed: bytes, cuts: list[tuple[int, int, bytes]]) -> bytes:
+        for place, length, new in cuts:
+            at = place % (len(seed) + 1)
+            seed = seed[:at] + new + seed[at + length :]
+        return seed
 
-    return st.builds(change, st.sampled_from(seeds), st.randoms(use_true_random=True))
+    cut = st.tuples(st.integers(0, _LONGEST_INPUT), st.integers(0, 12), st.binary(max_size=12))
+    return st.builds(change, st.sampled_from(seeds), st.lists(cut, min_size=1, max_size=5))
 
 
 def run(one: Run) -> list[str]:

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import pygit2
-import yaml
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
@@ -59,8 +58,8 @@ def _text(data: bytes) -> str:
     return data.decode("utf-8", "replace")
 
 
-def _bytes(paths: Iterable[Path], most: int = 20) -> tuple[bytes, ...]:
-    return tuple(dict.fromkeys(path.read_bytes() for path in paths))[:most]
+def _bytes(paths: Iterable[Path]) -> tuple[bytes, ...]:
+    return tuple(dict.fromkeys(path.read_bytes() for path in paths))[:20]
 
 
 def names_its_faults(check: Callable[[Any], object]) -> Callable[[Any], object]:
@@ -107,11 +106,6 @@ def goal_as_data(data: Any) -> None:
     of_reference = not isinstance(data, dict) or not any(str(key).startswith(ours) for key in data)
     if isinstance(found, tuple) and of_reference:
         assert_told(found)
-
-
-def _goals() -> st.SearchStrategy[Any]:
-    models = [forms.reference_goal(), forms.own_goal()]
-    return st.one_of(ANYTHING, *(_near(model, ANYTHING | TEXT) for model in models))
 
 
 def _near(value: Any, other: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
@@ -168,27 +162,13 @@ def config_file(data: bytes) -> None:
     load(_CONFIG | {_FILES[data[0] % len(_FILES)] if data else "": _text(data[1:])})
 
 
-@names_its_faults
 def chart_file(data: bytes) -> None:
-    _try({_CHARTS[data[0] % len(_CHARTS)] if data else "": _text(data[1:])})
+    chart_values((_CHARTS[data[0] % len(_CHARTS)] if data else "", _text(data[1:])))
 
 
 @names_its_faults
-def chart_values(file: tuple[str, Any]) -> None:
-    _try({file[0]: json.dumps(file[1])})
-
-
-def _try(changed: dict[str, str]) -> None:
-    try_configuration(state_of(load(_CONFIG | changed)))
-
-
-def _changed_charts() -> st.SearchStrategy[tuple[str, Any]]:
-    paths = [
-        path for path in _CHARTS if path.endswith((".yaml", ".json")) and "/templates/" not in path
-    ]
-    files = [(path, yaml.safe_load(_CONFIG[path])) for path in paths]
-    odd = ANYTHING.filter(_is_json)
-    return st.one_of([st.tuples(st.just(path), _near(data, odd)) for path, data in files])
+def chart_values(file: tuple[str, str]) -> None:
+    try_configuration(state_of(load(_CONFIG | dict([file]))))
 
 
 def _is_json(value: Any) -> bool:
@@ -196,6 +176,14 @@ def _is_json(value: Any) -> bool:
         return bool(json.dumps(value, allow_nan=False))
     except (TypeError, ValueError):
         return False
+
+
+_CHANGED_CHARTS = st.one_of([
+    st.tuples(st.just(path), _near(plain_yaml.load(_CONFIG[path]), odd).map(json.dumps))
+    for odd in [ANYTHING.filter(_is_json)]
+    for path in _CHARTS
+    if path.endswith((".yaml", ".json")) and "/templates/" not in path
+])  # fmt: skip
 
 
 def without_field(data: bytes) -> None:
@@ -419,6 +407,7 @@ _ALL_OBJECTS = st.fixed_dictionaries(
 )
 _LINES = [json.loads(line) for line in _SEEDS["journal-line"][0].splitlines()]
 _RULES = Path(__file__).parents[2] / "examples/experiment/rules.yaml"
+_GOAL_MODELS = (forms.reference_goal(), forms.own_goal())
 
 
 def _seeds(check: Callable[[bytes], object]) -> tuple[bytes, ...]:
@@ -427,7 +416,10 @@ def _seeds(check: Callable[[bytes], object]) -> tuple[bytes, ...]:
 
 TARGETS = (
     Target(goal_as_yaml, _bytes(_GOALS)),
-    Target(goal_as_data, values=_goals()),
+    Target(
+        goal_as_data,
+        values=st.one_of(ANYTHING, *(_near(model, ANYTHING | TEXT) for model in _GOAL_MODELS)),
+    ),
     Target(ros_message, values=st.one_of(map(_message, (Demand.Goal, DeploymentRequest.Goal)))),
     Target(
         data_to_ros_message,
@@ -436,7 +428,7 @@ TARGETS = (
     ),
     Target(config_file, _seeds_of(_FILES)),
     Target(chart_file, _seeds_of(_CHARTS)),
-    Target(chart_values, values=_changed_charts()),
+    Target(chart_values, values=_CHANGED_CHARTS),
     *(
         Target(one, tuple(_CONFIG[path].encode() for path in _FILES))
         for one in (set_key, without_field)
