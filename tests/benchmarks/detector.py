@@ -27,26 +27,18 @@ from tests.kit.detection import POSE, rule, text_of
 
 ENTITIES, HZ, SECONDS, WIDTH_M = 5000, 10, 4, 10_000
 ROS_SECONDS = 6
-OWN_TOPIC = {"cars": {"topic": "/cars/{entity}/pose", "type": POSE, "timeout": "5s"}}
-ONE_TOPIC = {
-    "cars": {"topic": "/poses", "type": POSE, "entity": "header.frame_id", "timeout": "5s"}
-}
+_CARS = {"topic": "/cars/{entity}/pose", "type": POSE, "timeout": "5s"}
+OWN_TOPIC = {"cars": _CARS}
+ONE_TOPIC = {"cars": _CARS | {"topic": "/poses", "entity": "header.frame_id"}}
 
 
 def rules() -> list[dict[str, Any]]:
     """Return 100 ``near`` rules, a ``together`` rule and a ``count`` rule."""
-    areas = [
-        rule(
-            f"near-{number}",
-            near={
-                "source": "cars",
-                "point": {"x": number % 10 * 1000 + 500, "y": number // 10 * 1000 + 500},
-                "start": 84,
-                "stop": 90,
-            },
-        )
-        for number in range(100)
+    centers = [
+        {"x": x, "y": y} for y in range(500, WIDTH_M, 1000) for x in range(500, WIDTH_M, 1000)
     ]
+    near = {"source": "cars", "start": 84, "stop": 90}
+    areas = [rule(f"near-{n}", near=near | {"point": point}) for n, point in enumerate(centers)]
     middle = {"x": 5000, "y": 5000}
     count = {"source": "cars", "point": middle, "radius": 500, "start": 10, "stop": 5}
     pair = rule("pair", together={"source": "cars", "start": 30, "stop": 35})
@@ -65,12 +57,8 @@ def without_ros() -> None:
         (chance.uniform(0, WIDTH_M), chance.uniform(0, WIDTH_M), chance.uniform(0, 6.28))
         for _ in range(ENTITIES)
     ]
-    state, events, spent = (
-        engine.start(0.0),
-        0,
-        {"deserializing": 0.0, "reading": 0.0, "rules": 0.0},
-    )
-    message = PoseStamped()
+    state, events, message = engine.start(0.0), 0, PoseStamped()
+    spent = dict.fromkeys(("deserializing", "reading", "rules"), 0.0)
     for step in range(1, SECONDS * HZ + 1):
         now, away = step / HZ, step * 13.9 / HZ
         sent = []
@@ -126,17 +114,14 @@ def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, 
     from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import PoseStamped
 
-    heard = {"messages": 0}
+    heard, names = {"messages": 0}, [f"car{number}" for number in range(entities)]
+    topics = list(dict.fromkeys(sources["cars"]["topic"].format(entity=name) for name in names))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "rules.yaml")
         path.write_text(text_of(*rules(), sources=sources))
         options = ["-p", "bookkeeping_topic:=''", "-p", f"rules:={path}"]
-        own = "{entity}" in sources["cars"]["topic"]
-        names = [f"car{number}" for number in range(entities)]
-        topics = [f"/cars/{name}/pose" for name in names] if own else ["/poses"]
-        command = ["demandops.cli.main", "detect", "--ros-args", *options]
-        if alone:
-            command = ["tests.benchmarks.detector", *topics]
+        detect = ["demandops.cli.main", "detect", "--ros-args", *options]
+        command = ["tests.benchmarks.detector", *topics] if alone else detect
         detecting = subprocess.Popen(
             [sys.executable, "-m", *command], stderr=subprocess.DEVNULL, stdout=subprocess.PIPE
         )

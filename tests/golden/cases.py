@@ -29,22 +29,11 @@ from tests.kit.memory import MemoryRepo
 
 Files = Mapping[str, str]
 
-GOLDEN = Path(__file__).parents[1] / "golden"
+GOLDEN = Path(__file__).parent
 
 EXPERIMENT = "experiment"
 FOLLOWING = ("argocd-experiment",)
-CASES = (
-    EXPERIMENT,
-    "differing-topic-names",
-    "charts-from-registries",
-    "mqtt-secured",
-    "zenoh",
-    "ros",
-    *FOLLOWING,
-    "argocd-charts-from-registries",
-    "overrides",
-    "scaling",
-)
+CASES = tuple(sorted(path.name for path in GOLDEN.glob("[a-z]*") if path.is_dir()))
 START = "0-start"
 DELETED = "DELETED"
 
@@ -79,19 +68,14 @@ def rendered(case: str) -> Mapping[str, Files]:
     return {name: dict(repo.files) for name, repo in play(case)}
 
 
-whole = rendered
-
-
 # ---- what is stored ----
 
 
 def read(case: str) -> dict[str, dict[str, str]]:
-    expected = GOLDEN / case / "expected"
     steps: dict[str, dict[str, str]] = {}
-    for path in sorted(expected.rglob("*")):
-        if path.is_file():
-            step, _, name = path.relative_to(expected).as_posix().partition("/")
-            steps.setdefault(step, {})[name] = path.read_text()
+    for path, text in texts_below(GOLDEN / case / "expected").items():
+        step, _, name = path.partition("/")
+        steps.setdefault(step, {})[name] = text
     return steps
 
 
