@@ -206,7 +206,13 @@ class Books:
             if subject[0] == "application":
                 topics = listed.topics or claim.topics
                 if key[0] == subject and listed.means(claim):
-                    yield from ((topic, key, topic) for topic in topics if topic in claim.topics)
+                    # a shutdown may leave out a topic's source too
+                    pairs = ((one, own) for one in topics for own in claim.topics)
+                    yield from (
+                        (one, key, own)
+                        for one, own in pairs
+                        if one[:2] == own[:2] and one[2] in ("", own[2])
+                    )
                 continue
             if not listed.means(claim):
                 continue

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-Goal = dict[str, Any]
-Item = dict[str, Any]
+from tests.kit.goals import Goal, Item
 
 Subject = tuple[str, str]
 """A subject: its kind (``application`` or ``connection``) and its id."""
