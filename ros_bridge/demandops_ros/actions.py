@@ -114,8 +114,11 @@ def _text(outcome: Receipt | BaseException) -> str:
     return f"{_code(outcome)}: {text}"
 
 
+NOT_HELD = "listed, but not held by the requester"
+
+
 def _not_held(receipt: Receipt) -> list[str]:
-    return [f"listed, but not held by the requester: {one_line(item)}" for item in receipt.not_held]
+    return [f"{NOT_HELD}: {one_line(item)}" for item in receipt.not_held]
 
 
 def _code(outcome: Receipt | BaseException) -> str:

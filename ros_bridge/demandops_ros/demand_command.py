@@ -14,7 +14,7 @@ from demandops.base.quoting import one_line
 from demandops.base.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from demandops.model.demand.goals import is_demand_goal
 
-from demandops_ros.actions import GoalSender
+from demandops_ros.actions import NOT_HELD, GoalSender
 from demandops_ros.client import DemandClient, DemandError, HeldDemand
 from demandops_ros.messages import fill_message
 from demandops_ros.node_parameters import ros_name
@@ -103,5 +103,9 @@ def _requested(
     outcome, _, commit = head.partition(": ")
     if not succeeded:
         raise DemandError(outcome, result.message)
-    warnings = [line.removeprefix("warning: ") for line in lines]
-    return {"outcome": outcome, "commit": commit or None, "warnings": warnings}
+    answer: dict[str, Any] = {"outcome": outcome, "commit": commit or None}
+    for line in lines:
+        said, _, text = line.partition(": ")
+        kind = {"warning": "warnings", NOT_HELD: "not_held"}.get(said)
+        answer.setdefault(kind or "effects", []).append(text if kind else line)
+    return answer

@@ -15,7 +15,7 @@ from demandops_ros import node_parameters
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
-from tests.unit.messages.text import FILE as MESSAGES
+from tests.unit.messages.test_messages import FILE as MESSAGES
 
 ROOT = Path(__file__).parents[2]
 FAULTS = {

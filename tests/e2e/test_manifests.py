@@ -21,8 +21,7 @@ from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Manifest, build_manifest
 from tests.golden.cases import CASES, rendered
 from tests.kit.cli import Run
-from tests.unit.render.test_inert import TRAPS, UNSEEN
-from tests.unit.render.test_yaml_as_helm import HELM_READS
+from tests.unit.render.test_inert import HELM_READS, TRAPS, UNSEEN
 
 ROOT = Path(__file__).resolve().parents[2]
 APPDEFS = (ROOT / "appdefs", ROOT / "examples" / "lane-detection" / "appdefs")

@@ -229,17 +229,3 @@ class TestVerify:
         assert on.refused("verify").startswith(f"error: {told}")
         with pytest.raises(SigningFailed, match="ssh-keygen, which signs the commits, is missing"):
             Signer(key)
-
-
-def test_commits_are_signed_off_if_the_settings_name_who_does(on: On, state: GitRepo) -> None:
-    platform = "Fleet Platform <platform@example.org>"
-    settings = state.files()["demandops.yaml"]
-    state.commit({"demandops.yaml": f"{settings}signedOffBy: {platform}\n"})
-    on.book(link("c"))
-    assert on("suspend", "--connection", "c", "-m", "Repair", "--yes").code == 0
-    form = "--format=%an|%(trailers:key=Signed-off-by,valueonly,separator=%x2C)"
-    by_person, by_generator = git(state.path, "log", "-2", form).splitlines()
-    name, _, signed = by_person.partition("|")
-    assert signed.startswith(f"{name} <")
-    assert by_generator.partition("|")[2] == platform
-    assert on("verify", "main~2..main").code == 0

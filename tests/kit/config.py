@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS, Config
+from demandops.model.config.override import Override, OverrideFile
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.new_repo import files
 from demandops.templating.values import evaluate
@@ -57,3 +58,9 @@ def override(*select: Mapping[str, Any], **fields: Any) -> str:
     head = {"apiVersion": "demandops/v1", "kind": "Override"}
     why = {"reason": "a field test", "owner": "petra"}
     return yaml.safe_dump(head | why | {"select": list(select)} | fields, sort_keys=False)
+
+
+def override_of(name: str, *select: Mapping[str, Any], **fields: Any) -> Override:
+    """Return what the file ``overrides/<name>.yaml`` of these fields means."""
+    file = OverrideFile.model_validate(yaml.safe_load(override(*select, **fields)))
+    return Override.from_file(name, file)

@@ -20,12 +20,6 @@ CLOUD: Topic = ("/vehicles/vehicle00/drivers/lidar/pointcloud", "vehicle00")
 EGO: Topic = ("/vehicles/vehicle00/ego_data", "vehicle00")
 STATION_CLOUD: Topic = ("/stations/station00/pointcloud", "station00")
 
-BODY = "apps[0].object_detection_fusion_app"
-ROS_NAMES = (
-    "is not a topic name that ROS 2 allows; begin each part with a single '/', and write letters, "
-    "digits and '_' after it, with no digit first"
-)
-
 EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("[1-8]-*.yaml"))
 """The files of the paper's eight demands, in order."""
 

@@ -239,8 +239,9 @@ def test_the_command_line_sends_goals_of_the_reference(
     sent = demandops("demand", joins, "--via", "ros", "--output", "json")
     (row,) = sent.json()
     assert (row["outcome"], row["commit"]) == ("booked", tip(Path(shared.state_repo))), sent.err
+    assert (row["warnings"], row["effects"][0].split()[0]) == ([], "starts")
     gone = demandops("demand", joins, "--via", "ros", "--release")
-    assert "released in " in gone.out, gone.err
+    assert ("released in " in gone.out, "\n  stops " in gone.out) == (True, True), gone.err
     assert operations(shared, before) == ["join", "shutdown"]
     again = demandops("demand", joins, "--via", "ros", "--release", "--output", "json")
     assert [each["code"] for each in again.json()[0]["faults"]] == ["not-held"]

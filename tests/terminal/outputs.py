@@ -86,7 +86,7 @@ def _done(command: str) -> None:
     assert run(shlex.split(command)) == 0, command
 
 
-def printed(command: str, patch: pytest.MonkeyPatch, columns: int = 80) -> str:
+def printed(command: str, patch: pytest.MonkeyPatch) -> str:
     """Return the output of a command without colours, and with ``c…`` in place of commit ids."""
     with patch.context() as own, TemporaryDirectory() as folder:
         own.setenv("NO_COLOR", "1")
@@ -98,7 +98,7 @@ def printed(command: str, patch: pytest.MonkeyPatch, columns: int = 80) -> str:
             own.setenv("XDG_CONFIG_HOME", str(Path.cwd() / "contexts"))
         if command.startswith("watch"):
             own.setattr(REAL, "sleep", _interrupt)
-        with terminal(own, columns, lines=40 if command.startswith("watch") else 1000) as screen:
+        with terminal(own, lines=40 if command.startswith("watch") else 1000) as screen:
             proposed = git(
                 "fleet.git", "for-each-ref", "--format=%(objectname)", "refs/heads/demand"
             )

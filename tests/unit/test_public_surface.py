@@ -8,8 +8,9 @@ Everything else is internal. `docs/public-api.md` is the same list for people.
 from __future__ import annotations
 
 import inspect
+import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,10 +18,13 @@ from typing import Any
 import click
 import demandops
 import demandops_ros
+import jsonschema_rs
 import pytest
 import yaml
 from demandops.base import settings
+from demandops.base.naming import PATTERN_WORDS
 from demandops.cli import main
+from demandops.cli.authoring import schema
 from demandops.cli.authoring.schema import SCHEMAS
 
 from tests.golden.cases import CASES, rendered
@@ -140,6 +144,62 @@ def test_people_find_everything_in_the_documentation() -> None:
     names = {*PUBLIC["environment"], *PUBLIC["client"], *SCHEMAS}
     names |= {*map(str, PUBLIC["exit codes"].values()), *interface_names, *kinds}
     assert {*names, settings.API_VERSION} - listed == set()
+
+
+# ---- the published schemas ----
+
+
+def properties(name: str) -> Iterator[tuple[str, dict[str, Any], dict[str, Any]]]:
+    """Yield each property of a published schema: its name, its schema, and the whole document."""
+    document = json.loads(schema.text(name))
+    root = SCHEMAS[name][0].__name__
+    for model, part in {root: document, **document.get("$defs", {})}.items():
+        for field, one in part.get("properties", {}).items():
+            yield f"{model}.{field}", one, document
+
+
+@pytest.mark.parametrize("name", SCHEMAS)
+def test_every_property_has_a_description_and_a_valid_example(name: str) -> None:
+    bare = [
+        field
+        for field, one, _ in properties(name)
+        if not one.get("description") or not one.get("examples")
+    ]
+    assert bare == [], "add them to templates/schemas/properties.yaml"
+    for field, one, document in properties(name):
+        own = {"$schema": document["$schema"], "$defs": document.get("$defs", {}), **one}
+        validator = jsonschema_rs.validator_for(own)
+        for example in one["examples"]:
+            faults = [error.message for error in validator.iter_errors(example)]
+            assert faults == [], (field, example)
+
+
+def test_nothing_else_is_described_and_each_entry_has_at_most_an_example() -> None:
+    known = {field for name in SCHEMAS for field, *_ in properties(name)}
+    listed = {
+        f"{model.rpartition('/')[2]}.{field}": said
+        for model, fields in schema._properties().items()
+        if model != "inherits"
+        for field, said in fields.items()
+    }
+    assert listed.keys() - known == set()
+    odd = [field for field, said in listed.items() if len(said) > 2 or not isinstance(said[0], str)]
+    assert odd == []
+
+
+def patterns_of(part: Any) -> set[str]:
+    if isinstance(part, list):
+        return {found for each in part for found in patterns_of(each)}
+    if not isinstance(part, dict):
+        return set()
+    found = {part["pattern"]} if isinstance(part.get("pattern"), str) else set[str]()
+    found |= {*part.get("patternProperties", {})}
+    return found | {each for value in part.values() for each in patterns_of(value)}
+
+
+def test_every_pattern_of_a_file_is_said_in_words() -> None:
+    used = {one for model, _ in SCHEMAS.values() for one in patterns_of(model.model_json_schema())}
+    assert used == PATTERN_WORDS.keys()
 
 
 if __name__ == "__main__":  # writes the listing; review the diff

@@ -173,8 +173,6 @@ PATTERN_WORDS = {
     r"^[a-z][a-z0-9]{0,9}$": "up to ten small letters and digits, a letter first, for example od",
     r"^[a-z][a-z0-9_]*$": f"{_LOWER} and '_', with a letter first, for example sensor_msgs",
     r"^[a-z][A-Za-z0-9_]*$": f"{_ANY} and '_', with a small letter first, for example memoryGiB",
-    r"^[a-z0-9./-]+$": f"{_LOWER}, '.', '/' and '-', such as cpu or nvidia.com/gpu",
-    r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi)?$": "a quantity, such as 500m, 2 or 1Gi",
     r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$": "the name of a resource, such as cpu or nvidia.com/gpu",
     r"^[A-Za-z_][A-Za-z0-9_]*$": f"{_ANY} and '_', with no digit first, for example ROS_DOMAIN_ID",
     r"^[A-Za-z0-9_.-]+$": f"{_ANY}, '_', '.' and '-', such as start.launch.py",

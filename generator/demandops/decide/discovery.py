@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime, timedelta
 from typing import Any, NamedTuple
 
@@ -19,7 +19,14 @@ from pydantic import TypeAdapter, ValidationError
 from demandops.base.quantities import amount_of
 from demandops.base.quoting import quoted
 from demandops.model.config.base_model import Word, seconds_of, time_text
-from demandops.model.config.discovered import DiscoveredId, DiscoveredNode, path_of, read, text_of
+from demandops.model.config.discovered import (
+    DiscoveredId,
+    DiscoveredNode,
+    is_discovered,
+    path_of,
+    read,
+    text_of,
+)
 from demandops.model.config.inventory import (
     NODE_LABEL,
     Cluster,
@@ -73,13 +80,12 @@ def discover(
     seen: Iterable[ClusterNode],
     before: str | None,
     now: datetime,
-    taken: Container[str],
+    files: Mapping[str, str],
     is_needed: Callable[[str], bool],
 ) -> Discovered:
     """Return the file of a cluster after ``before``, given all its nodes.
 
-    ``taken`` are the ids that other clusters have, and ``is_needed`` says whether a node may not
-    leave yet.
+    ``files`` has the file of each node by id, and ``is_needed`` says whether a node must stay yet.
     """
     path, discovery = path_of(cluster.name), cluster.discovery or Discovery()
     known, problems = {node.id: node for node in read(before, path)}, list[str]()
@@ -89,10 +95,13 @@ def discover(
     nodes, came, left, changed = dict[str, DiscoveredNode](), [], [], []
     for id, sources in sorted(by_id.items()):
         source, old = sources[0], known.get(id)
-        if why := _refused(id, sources, taken):
+        file = files.get(id, path)
+        if why := _refused(id, sources, is_taken=file != path and is_discovered(file)):
             problems.append(why)
             nodes |= {id: old} if old else {}
             continue
+        if file != path:
+            problems.append(f"node '{id}' is as {file} lists it, not as the cluster has it")
         node = nodes[id] = _node(id, source, discovery, problems)
         if old is None or old.gone_since is not None:
             came.append(f"{id}{' is back' if old else ''}: {_described(node)}")
@@ -119,14 +128,14 @@ def discover(
     )
 
 
-def _refused(id: str, sources: list[ClusterNode], taken: Container[str]) -> str:
+def _refused(id: str, sources: list[ClusterNode], *, is_taken: bool) -> str:
     # what stays as it was: two machines with one id would share what is placed on one of them
     if not _is_valid(_ID, id):
         return f"node {quoted(sources[0].name)}: {NODE_LABEL} {quoted(id)} is no id; label it anew"
     if len(sources) > 1:
         named = " and ".join(sorted(quoted(each.name) for each in sources)[:2])
         return f"{NODE_LABEL} '{id}' is the label of {named}; label one of them anew"
-    if id in taken:
+    if is_taken:
         return f"node '{id}' is in another cluster already; label one of them anew"
     return ""
 
@@ -146,14 +155,15 @@ def _node(id: str, source: ClusterNode, how: Discovery, problems: list[str]) -> 
     )
     properties = {name: _read(labels[key]) for name, key in names.items()}
     role = labels.get(how.type_label)
-    capacity = {
-        resource: amount
-        for resource, amount in sorted(source.allocatable.items())
-        if resource != _UNREQUESTED
-        and _is_valid(_RESOURCE, resource)
-        and _is_valid(_AMOUNT, amount)
-        and (amount_of(amount) or resource in _UNLIMITED)
-    }
+    capacity = dict[str, str]()
+    for resource, amount in sorted(source.allocatable.items()):
+        if resource == _UNREQUESTED or not _is_valid(_RESOURCE, resource):
+            continue
+        if not _is_valid(_AMOUNT, amount):
+            problems.append(f"node '{id}': it offers no {resource}, as {quoted(amount)} is unclear")
+            amount = "0"  # noqa: PLW2901
+        if amount_of(amount) or resource in _UNLIMITED:
+            capacity[resource] = amount
     return DiscoveredNode(
         id=id,
         type=role if role is not None and usable(_WORD, role, how.type_label) else None,

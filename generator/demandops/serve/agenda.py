@@ -113,7 +113,7 @@ class Agenda:
         self._tried: World | None = None
         self.left: list[str] = []  # waiting demands that the last round left for later
         self.must_judge, self._judge_at = False, now
-        self.nodes = NodeDiscovery(runtime)
+        self.nodes: list[NodeDiscovery] = []  # one, if clusters are asked for their nodes
 
     def due_in(self, state: State, main: str, *, has_news: bool = False) -> dict[What, float]:
         # in seconds; ``main`` is empty if no proposal awaits approval, and ``has_news`` says
@@ -131,7 +131,7 @@ class Agenda:
             seconds = (end - self._runtime.now()).total_seconds() + 0.01
             own_work = min(own_work, max(seconds, self.waits_s("end", name)))
         own_work = min([own_work, *(self.waits_s("drain", node) for node in _to_drain(state))])
-        own_work = min(own_work, self.nodes.due_in(state))
+        own_work = min([own_work, *(nodes.due_in(state) for nodes in self.nodes)])
         first = state.ledger.first_to_end()
         if first is not self._first_to_end:  # a search is slow if many leases end at one time
             self._first_to_end, self._next_end = first, state.ledger.next_lease_end()
@@ -188,7 +188,8 @@ class Agenda:
                 for problem in error.faults:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
         # what clusters say may drain a node
-        self.nodes.commit_due(commits)
+        for nodes in self.nodes:
+            nodes.commit_due(commits)
         # what runs moves before what waits is booked
         for node in _to_drain(commits.head.state):
             if not self.waits_s("drain", node):

@@ -11,7 +11,7 @@ from demandops.base.runtime import Runtime
 from demandops.decide.discovery import ClusterNode, Discovered, discover
 from demandops.decide.state import State
 from demandops.model.config.config import NODES_FILE, Config
-from demandops.model.config.discovered import DISCOVERED_ROOT, is_discovered, path_of
+from demandops.model.config.discovered import DISCOVERED_ROOT, path_of
 from demandops.repo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
@@ -29,9 +29,8 @@ _PAUSE_S = 60.0
 class NodeDiscovery:
     """A part of the agenda. Any thread may call :meth:`has_news`."""
 
-    def __init__(self, runtime: Runtime) -> None:
-        self._runtime = runtime
-        self.nodes_of: NodesOf | None = None
+    def __init__(self, nodes_of: NodesOf, runtime: Runtime) -> None:
+        self._nodes_of, self._runtime = nodes_of, runtime
         self._config: Config | None = None
         self._news_at, self._next_at, self._has_gone = inf, -inf, False
         self._told: frozenset[str] = frozenset()
@@ -40,8 +39,6 @@ class NodeDiscovery:
         self._news_at = min(self._news_at, self._runtime.monotonic())
 
     def due_in(self, state: State) -> float:
-        if self.nodes_of is None:
-            return inf
         now = self._runtime.monotonic()
         at = now if state.config is not self._config else self._news_at + _GATHER_S
         # claims on a node that is gone may end at any time
@@ -50,10 +47,10 @@ class NodeDiscovery:
 
     def commit_due(self, commits: CommitBatch) -> None:
         state = commits.head.state
-        if self.nodes_of is None or self.due_in(state):
+        if self.due_in(state):
             return
         self._config, self._news_at = state.config, inf  # before the nodes are read: news may come
-        seen, texts = self.nodes_of(state.config), commits.texts(DISCOVERED_ROOT)
+        seen, texts = self._nodes_of(state.config), commits.texts(DISCOVERED_ROOT)
         if not seen and not texts:
             return
         self._next_at = self._runtime.monotonic() + _PAUSE_S
@@ -101,7 +98,6 @@ def _found(
     found = [Discovered(path, None) for path in sorted({*texts} - {*asked})]
     for path, cluster in asked.items():
         if cluster.name in seen:
-            taken = {id for id, file in files.items() if is_discovered(file) and file != path}
             nodes = seen[cluster.name]
-            found.append(discover(cluster, nodes, texts.get(path), now, taken, is_needed))
+            found.append(discover(cluster, nodes, texts.get(path), now, files, is_needed))
     return found

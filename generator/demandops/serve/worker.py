@@ -27,7 +27,7 @@ from demandops.serve.agenda import Agenda, Backoff, RateLimit, What
 from demandops.serve.approvals import Approvals, Result, commit_without_files
 from demandops.serve.demands import Demands
 from demandops.serve.journal import Receipt, Ticket
-from demandops.serve.node_discovery import NodesOf
+from demandops.serve.node_discovery import NodeDiscovery, NodesOf
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 log = logging.getLogger("demandops")
@@ -94,11 +94,12 @@ class Worker:
 
     def take_over_nodes(self, nodes_of: NodesOf) -> None:
         """Keep the nodes of clusters as ``nodes_of`` gives them; ``nodes_changed`` says when."""
-        self._agenda.nodes.nodes_of = nodes_of
+        self._agenda.nodes = [NodeDiscovery(nodes_of, self._runtime)]
         self._demands.wake()
 
     def nodes_changed(self) -> None:
-        self._agenda.nodes.has_news()
+        for nodes in self._agenda.nodes:
+            nodes.has_news()
         self._demands.wake()
 
     def end_soon(self) -> None:

@@ -13,7 +13,7 @@ from random import Random
 import pygit2
 import pytest
 import yaml
-from demandops.base.errors import DemandOpsError, InvalidInput, Refused, StateRepoError
+from demandops.base.errors import DemandOpsError, Refused
 from demandops.base.settings import GENERATED_ROOTS
 from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot as snapshots
@@ -24,13 +24,12 @@ from tests.kit.chance import IN_FULL
 from tests.kit.config import override
 from tests.kit.repo import GitRepo, differing
 from tests.kit.repo import read as text
-from tests.kit.rig import Person, goal, leave
+from tests.kit.rig import Person, goal
 
 TABLES = plain_yaml.beside(__file__)
 CLUSTERS, NODES, IMAGES = "inventory/clusters.yaml", "inventory/nodes.yaml", "registry/images.yaml"
 DETECTION = "clusters/c-its/perception/edge/od-edge-station00.yaml"
 TWO = override({"services": ["object-detection"], "nodes": ["edge"]}, replicas=2)
-BROKEN = override({"services": ["object-fusion"], "nodes": ["edge"]}, replicas="many")
 
 
 def values(bare: Path) -> tuple[str, int]:
@@ -230,55 +229,3 @@ def test_broken_files_are_judged_once_and_not_on_each_demand(
     rig.book(generator, goal(5))
     assert len(parsed) == judged
     rig.assert_sound(bare)
-
-
-@pytest.mark.parametrize(
-    "files",
-    [
-        {"ledger/applications/00/x/y.yaml": f"apiVersion: demandops.ledger/v{'9' * 5000}\n"},
-        {"ledger/shutdowns/aa/x.yaml": "of an earlier version\n"},
-        {"appdefs": "{{ cycler() }}"},
-        {"appdefs": "{{ 'x'|truncate(-1) }}"},
-        {"appdefs": "{{ 1|dictsort }}"},
-        {"appdefs": f"{{{{ '{'9' * 400}.0'|float|int }}}}"},
-    ],
-)
-def test_no_file_that_a_person_writes_stops_the_demands(
-    bare: Path, person: Person, files: dict[str, str]
-) -> None:
-    person.fetch()
-    if "appdefs" in files:
-        (path,) = person.folder.glob("appdefs/*/values/object-detection.yaml.j2")
-        name = str(path.relative_to(person.folder))
-        files = {name: f"{path.read_text()}\nodd: {files['appdefs']}\n"}
-    person.change(files)
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1), goal(2))
-    with rig.running(bare) as generator:
-        rig.book(generator, leave(1), goal(3))
-    outcomes = [dict(commit.trailers).get("Operation") for commit in rig.commits(bare)]
-    assert [one for one in outcomes if one in ("join", "shutdown")] == [
-        *("join", "join", "shutdown", "join")
-    ]
-
-
-def test_after_people_squash_a_history_that_is_not_valid_demands_wait_for_valid_files(
-    bare: Path, person: Person
-) -> None:
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-        person.change({IMAGES: tagged(bare, "v2", "x")})
-        rig.book(generator, goal(2))
-        squashed = rig.git(bare, "commit-tree", "main^{tree}", "-m", "The history in one commit")
-        rig.git(bare, "update-ref", "refs/heads/main", squashed)
-        with pytest.raises(StateRepoError, match=f"{IMAGES}: kind: .* set main back"):
-            generator.submit(goal(3)).future.result(rig.PATIENCE_S)
-    rig.git(bare, "reflog", "expire", "--expire=now", "--all")
-    rig.git(bare, "gc", "--quiet", "--prune=now")
-    with pytest.raises(InvalidInput, match=f"^{IMAGES}: kind: "):
-        Generator(str(bare))
-    person.change({IMAGES: tagged(bare, "v2")})
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(4))
-        assert values(bare)[0] == "v2"
-    rig.assert_sound(bare, verify_last=2)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import errno
 import os
-import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pygit2
@@ -198,51 +196,7 @@ def test_a_commit_of_an_odd_encoding_or_time_is_like_any_other(
     assert rig.differing(bare) == {}
 
 
-# ---- a damaged clone ----
-
-
-def _truncate_packs(clone: Path) -> None:
-    for pack in clone.glob("objects/pack/*.pack"):
-        pack.chmod(0o644)
-        os.truncate(pack, pack.stat().st_size // 2)
-
-
-def _drop_indexes(clone: Path) -> None:
-    for index in clone.glob("objects/pack/*.idx"):
-        index.unlink()
-
-
-def _cut_off(clone: Path) -> None:
-    """Leave a clone as a process that was killed while it made the clone."""
-    for part in ("packed-refs", "refs/remotes/origin/main"):
-        (clone / part).unlink(missing_ok=True)
-    clone.with_name("clone.git.partial").mkdir()
-
-
-DAMAGES: dict[str, Callable[[Path], object]] = {
-    "truncated-packs": _truncate_packs,
-    "no-indexes": _drop_indexes,
-    "broken-head": lambda clone: (clone / "HEAD").write_text("nonsense\n"),
-    "empty-config": lambda clone: (clone / "config").write_text(""),
-    "no-objects": lambda clone: shutil.rmtree(clone / "objects"),
-    # a living process would have locked the slot
-    "a-lock": lambda clone: (clone / "refs/remotes/origin/main.lock").touch(),
-    "cut-off": _cut_off,
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_clone_is_made_anew(url: str, bare: Path, person: Person, damage: str) -> None:
-    with rig.running(url) as generator:
-        rig.book(generator, goal(1))
-        clone = generator._slot.folder / "clone.git"
-    rig.git(clone, "repack", "-adq")
-    DAMAGES[damage](clone)
-    person.change({"README.md": "Hello\n"})
-    with rig.running(url) as generator:
-        rig.book(generator, goal(2))
-        assert str(generator.snapshot.commit) == tip(bare)
-    rig.assert_sound(bare)
+# ---- what cannot be read ----
 
 
 def test_a_clone_that_cannot_be_read_meanwhile_is_named_and_waited_for(

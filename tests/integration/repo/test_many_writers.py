@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from contextlib import suppress
-from itertools import count, pairwise
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -165,23 +165,3 @@ def test_housekeeping_by_git_during_demands_loses_nothing(generator: Generator, 
         thread.join(rig.PATIENCE_S)
     assert len(rig.operations(bare)) == 15
     rig.assert_sound(bare, verify_last=5)
-
-
-def test_the_remote_is_never_force_pushed_and_nothing_is_merged(
-    url: str, bare: Path, person: Person
-) -> None:
-    rig.git(bare, "config", "receive.denyNonFastForwards", "true")
-    rig.git(bare, "config", "core.logAllRefUpdates", "always")
-    with rig.running(url) as generator:
-        for number in range(4):
-            if number:
-                person.change({"README.md": f"{number}\n"})
-            rig.book(generator, goal(number))
-    moves = rig.git(bare, "log", "--walk-reflogs", "--format=%H", "main").splitlines()[::-1]
-    for older, newer in pairwise(moves):
-        rig.git(bare, "merge-base", "--is-ancestor", older, newer)
-    assert [commit.one("Operation") for commit in rig.commits(bare)] == ["join", *["", "join"] * 3]
-    rig.assert_sound(bare)
-
-
-# ---- a clone that is behind ----

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import StateRepoError
+from demandops.base.errors import DemandOpsError
 from demandops.base.naming import Subject, SubjectKind
 from demandops.decide.state import rendered_files
 from demandops.model.demand import goals as demand_goals
@@ -410,8 +411,13 @@ class Story:
         """Let the disk of the clone of `remote`, which is stopped, lose a file of main."""
         rig.lose(self._data / "remote/slot-0/clone.git", f"refs/remotes/origin/main:{path}")
 
+    def damage(self, command: str) -> None:
+        """Run a shell command in the clone of `remote`, which is stopped."""
+        clone = self._data / "remote/slot-0/clone.git"
+        subprocess.run(["sh", "-ec", command], cwd=clone, check=True)
+
     def cannot_start(self, why: str) -> None:
-        with pytest.raises(StateRepoError, match=why):
+        with pytest.raises(DemandOpsError, match=why):
             Generator(str(self._bare))
 
     def http(self, faults: Mapping[str, Any]) -> None:

@@ -159,64 +159,38 @@ SOURCES: dict[str, dict[str, Any]] = {
 }
 
 
-def application(
-    wanted: dict[str, Any],
-    *,
-    sync: str = "",
-    at: str = "",
-    compared: dict[str, Any] | None = None,
-    operation: dict[str, Any] | None = None,
-    conditions: tuple[dict[str, str], ...] = (),
-    health: str = "Healthy",
-    resources: tuple[dict[str, str], ...] = (),
-) -> dict[str, Any]:
-    """Return an Application with the source ``wanted``, which was compared if ``sync`` is set."""
-    status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
-    status["health"] = {"status": health, "lastTransitionTime": AT}
-    if sync:
-        against = {"source": wanted if compared is None else compared}
-        status["sync"] = {"status": sync, "revision": at, "comparedTo": against}
-    if operation:
-        status["operationState"] = operation
-    return {"metadata": {"name": "x"}, "spec": {"source": wanted}, "status": status}
+def application(default: str, **fields: Any) -> dict[str, Any]:
+    """Return the Application that a case describes; it was compared if ``sync`` is set."""
+    source = fields.get("source", default)
+    wanted, names = SOURCES[source], fields.get("resources", ())
+    named = {"group": "apps", "kind": "Deployment", "namespace": "ns"}
+    status: dict[str, Any] = {
+        "conditions": [condition(kind, "", text) for kind, text in fields.get("conditions", ())],
+        "resources": [named | {"name": name} for name in names],
+        "health": {"status": fields.get("health", "Healthy"), "lastTransitionTime": AT},
+    }
+    if "sync" in fields:
+        against = {"source": SOURCES[fields.get("compared", source)]}
+        status["sync"] = {"status": fields["sync"], "revision": fields.get("at", "")}
+        status["sync"]["comparedTo"] = against
+    if "operation" in fields:
+        status["operationState"] = synced(**{"of": default} | fields["operation"])
+    deleted = {"deletionTimestamp": AT} if fields.get("deleted") else {}
+    return {"metadata": {"name": "x"} | deleted, "spec": {"source": wanted}, "status": status}
 
 
-def synced(phase: str, revision: str, message: str = "", **more: Any) -> dict[str, Any]:
-    """Return the ``operationState`` of a sync from the source ``of``, by default the folder."""
-    result = {"revision": revision, "source": more.pop("of", FOLDER)}
-    result["resources"] = more.pop("resources", [])
+def synced(phase: str, revision: str, of: str, message: str = "", **more: Any) -> dict[str, Any]:
+    """Return the ``operationState`` of a sync from the source ``of``."""
+    result = {"revision": revision, "source": SOURCES[of], "resources": more.pop("resources", [])}
     asked = {"sync": {"revision": revision, "resources": more.pop("only", None)}}
     return {
         "phase": phase, "message": message, "syncResult": result, "operation": asked, **more
     }  # fmt: skip
 
 
-def described(default: str, fields: dict[str, Any]) -> dict[str, Any]:
-    """Return the Application that a case describes."""
-    fields, wanted = {**fields}, SOURCES[fields.get("source", default)]
-    fields.pop("source", None)
-    is_deleted = fields.pop("deleted", False)
-    if "compared" in fields:
-        fields["compared"] = SOURCES[fields["compared"]]
-    if "operation" in fields:
-        operation = {**fields["operation"]}
-        operation["of"] = SOURCES[operation.get("of", default)]
-        fields["operation"] = synced(**operation)
-    fields["conditions"] = [
-        condition(kind, "", text) for kind, text in fields.get("conditions", ())
-    ]
-    fields["resources"] = [
-        {"group": "apps", "kind": "Deployment", "namespace": "ns", "name": name}
-        for name in fields.get("resources", ())
-    ]
-    made = application(wanted, **fields)
-    made["metadata"] |= {"deletionTimestamp": AT} if is_deleted else {}
-    return made
-
-
 @pytest.mark.parametrize("case", ARGOCD_CASES["domain"], ids=itemgetter("when"))
 def test_an_access_domain_is_as_far_as_the_application_over_its_folder(case: Case) -> None:
-    objects = {APPLICATION: described("folder", case["over"])} if "over" in case else {}
+    objects = {APPLICATION: application("folder", **case["over"])} if "over" in case else {}
     health = ARGOCD.domain_health(IN_ARGOCD, "b", objects, COMMITS)
     assert told(health, case) == case
     assert health.object in ("", "Application argocd/demandops-perception")
@@ -226,9 +200,9 @@ def test_an_access_domain_is_as_far_as_the_application_over_its_folder(case: Cas
 def test_a_release_is_healthy_when_it_is_synced_as_it_stands_now_and_all_is_there(
     case: Case,
 ) -> None:
-    objects = {APPLICATION: application(FOLDER, sync="Synced", at="b"), **deployments(case)}
+    objects = {APPLICATION: application("folder", sync="Synced", at="b"), **deployments(case)}
     if "child" in case:
-        objects[CHILD] = described("new", case["child"])
+        objects[CHILD] = application("new", **case["child"])
     history = Letters([case["changing"]] if "changing" in case else [])
     health = ARGOCD.release_health(
         targets_in(IN_ARGOCD)[case.get("of", "service")], "b", objects, history
@@ -237,18 +211,15 @@ def test_a_release_is_healthy_when_it_is_synced_as_it_stands_now_and_all_is_ther
 
 
 def test_applied_commit_and_last_transition_come_from_the_applications_in_the_cluster() -> None:
-    objects = {
-        APPLICATION: application(FOLDER, sync="Synced", at="b"),
-        CHILD: application(source()),
-    }
-    assert ARGOCD.applied_commit(IN_ARGOCD, objects) == "b"
+    over, child = application("folder", sync="Synced", at="b"), application("new")
+    succeeded = {"phase": "Succeeded", "revision": "b"}
+    under_way = application("folder", sync="OutOfSync", at="c", operation=succeeded)
+    assert ARGOCD.applied_commit(IN_ARGOCD, {APPLICATION: over}) == "b"
     assert ARGOCD.applied_commit(IN_ARGOCD, {}) == ""
-    succeeded = synced("Succeeded", "b")
-    under_way = application(FOLDER, sync="OutOfSync", at="c", operation=succeeded)
     assert ARGOCD.applied_commit(IN_ARGOCD, {APPLICATION: under_way}) == "b"
     service, client, _ = targets_in(IN_ARGOCD).values()
-    assert ARGOCD.last_transition(service, objects) == AT
-    assert ARGOCD.last_transition(client, objects) == ""
+    assert ARGOCD.last_transition(service, {CHILD: child}) == AT
+    assert ARGOCD.last_transition(client, {CHILD: child}) == ""
 
 
 def test_only_one_object_of_argo_cds_namespace_is_read() -> None:

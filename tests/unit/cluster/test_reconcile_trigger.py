@@ -78,17 +78,7 @@ def reached(api: KubeApi, folder: Path) -> ClusterAccess:
     return ClusterAccess(kubeconfig=kubeconfig(folder, api.url))
 
 
-@pytest.mark.parametrize(
-    ("case", "path", "annotation"),
-    [
-        ("experiment",
-         "source.toolkit.fluxcd.io/v1/namespaces/perception/gitrepositories/demandops",
-         REQUESTED_AT),
-        ("argocd-experiment",
-         "argoproj.io/v1alpha1/namespaces/argocd/applications/demandops-perception",
-         "argocd.argoproj.io/refresh"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("case", "path", "annotation"), TABLES["annotated"])
 def test_the_object_that_fetches_is_annotated(
     api: KubeApi, tmp_path: Path, case: str, path: str, annotation: str
 ) -> None:

@@ -215,12 +215,6 @@ def test_the_size_of_a_demand_is_checked_before_anything_is_planned(made: Goal) 
     assert calls < 3_000_000
 
 
-def test_derived_connections_count_before_they_are_booked() -> None:
-    assert codes(repo(demandItems=100).take(demand([app(0, 60, node="edge")]))) == {"too-large"}
-    books = repo(demandItems=100)
-    assert books.send(demand([app(0, 60, node="edge", connect="none")])).outcome == "booked"
-
-
 @pytest.mark.parametrize(
     "made",
     [

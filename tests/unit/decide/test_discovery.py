@@ -1,10 +1,12 @@
 """What becomes of a cluster's file of discovered nodes, case by case."""
 
+import json
 from datetime import datetime, timezone
 from typing import Any
 
 import pytest
 from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput
 from demandops.decide.discovery import ClusterNode, discover
 from demandops.model.config import discovered
 from demandops.model.config.discovered import DiscoveredNode
@@ -13,9 +15,9 @@ from demandops.model.config.load import load
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import configuration
-from tests.kit.plain_yaml import beside
+from tests.kit.config import configuration, edited, skeleton
 
 FROM_CLUSTER = """\
 apiVersion: demandops/v1
@@ -23,7 +25,9 @@ kind: Clusters
 clusters: [{name: c-its, nodes: from-cluster}]
 """
 NOW = datetime(2026, 5, 4, 12, tzinfo=timezone.utc)
-CASES = beside(__file__)
+PATH = "inventory/discovered/c-its.yaml"
+POLICY = "policy/access-domains.yaml"
+CASES = plain_yaml.beside(__file__)
 
 
 def nodes(written: list[dict[str, Any]]) -> str:
@@ -43,8 +47,8 @@ def test_a_file_follows_its_cluster(case: dict[str, Any]) -> None:
     before = nodes(case["before"]) if "before" in case else None
     now = [seen(f"machine-{n}", node) for n, node in enumerate(case.get("seen", ()))]
     needed = case.get("needed", ())
-    found = discover(cluster, now, before, NOW, case.get("taken", ()), lambda id: id in needed)
-    assert found.path == "inventory/discovered/c-its.yaml"
+    found = discover(cluster, now, before, NOW, case.get("files", {}), lambda id: id in needed)
+    assert found.path == PATH
     told = {"came": found.came, "left": found.left, "changed": found.changed}
     told["problems"] = found.problems
     after = strict_yaml.load(found.text)["nodes"] if found.text else None
@@ -63,6 +67,25 @@ def test_what_was_written_is_what_is_read() -> None:
         assert discovered.text_of(discovered.read(text, "file")) == text
 
 
+def test_labels_add_to_what_each_node_has() -> None:
+    entry = {"capabilities": ["gpu"], "properties": {"size": 1, "doors": 2}, "capacity": {"gpu": 1}}
+    how = f", discovery: {{entry: {json.dumps(entry)}}}}}]"
+    clusters = FROM_CLUSTER.replace("}]", how)
+    own = {"capabilities": ["lidar"], "properties": {"size": 3}, "capacity": {"cpu": "4"}}
+    files = {"inventory/clusters.yaml": clusters, PATH: nodes([{"id": "bus0", **own}])}
+    node = load(configuration(files)).nodes["bus0"]
+    assert node.capabilities == ("gpu", "lidar")
+    assert node.properties == {"size": 3, "doors": 2}
+    assert node.capacity == {"cpu": "4", "gpu": "1"}
+
+
+def test_the_faults_of_an_edited_file_are_told_there() -> None:
+    odd = nodes([{"id": "bus0", "type": "bus"}]).replace("type: bus", "type: -x")
+    with pytest.raises(InvalidInput) as error:
+        load(configuration({"inventory/clusters.yaml": FROM_CLUSTER, PATH: odd}))
+    assert [(each.file, each.field) for each in error.value.faults] == [(PATH, "nodes[0].type")]
+
+
 odd = ["1", "true", "gpu", "0.5", "4Gi", "a..b", "é", "a b", "a/b", "a@b", "-a", "{n}", "x" * 64]
 anything = st.text(max_size=9) | st.sampled_from(odd)
 known = st.sampled_from(["demandops/type", "capability.demandops/gpu", "property.demandops/size"])
@@ -74,13 +97,9 @@ texts = st.dictionaries(keys, anything, max_size=5)
 def cluster_nodes(draw: st.DrawFn) -> list[ClusterNode]:
     ids = draw(st.lists(st.sampled_from(["bus0", "bus1", "cloud"]) | anything, max_size=4))
     return [
-        ClusterNode(name, {**draw(texts), "node_id": id}, draw(texts), draw(st.booleans()), {})
-        for name, id in enumerate_names(ids)
+        ClusterNode(f"m{n}", {**draw(texts), "node_id": id}, draw(texts), draw(st.booleans()), {})
+        for n, id in enumerate(ids)
     ]
-
-
-def enumerate_names(ids: list[str]) -> list[tuple[str, str]]:
-    return [(f"machine-{number}", id) for number, id in enumerate(ids)]
 
 
 @given(cluster_nodes(), cluster_nodes())
@@ -91,9 +110,28 @@ def test_whatever_a_cluster_says_the_configuration_stays_valid(
     cluster = Cluster.model_validate({"name": "c-its", "nodes": "from-cluster"})
     text = None
     for seen in (first, second):
-        found = discover(cluster, seen, text, NOW, (), lambda id: False)
+        found = discover(cluster, seen, text, NOW, {}, lambda id: False)
         text = found.text
         config = load(configuration({"inventory/clusters.yaml": FROM_CLUSTER, found.path: text}))
-        assert config.nodes["cloud"].type == "cloud", "as it is listed"
-        again = discover(cluster, seen, text, NOW, (), lambda id: False)
+        cloud = config.nodes["cloud"]
+        assert (cloud.type, cloud.drained) == ("cloud", False), "as it is listed"
+        again = discover(cluster, seen, text, NOW, {}, lambda id: False)
         assert (again.text, again.came, again.left, again.changed) == (text, (), (), ())
+
+
+def test_values_and_nodes_that_contradict_other_files_do_not_count() -> None:
+    sizes = {"bus1": 3, "bus2": "large", "bus3": "large"}
+    found = [{"id": id, "properties": {"size": size}} for id, size in sizes.items()]
+    file = nodes([*found, {"id": "bus9"}])
+    size = ("- id: cloud\n", "- id: cloud\n    properties: {size: 3}\n")
+    changed = edited("inventory/nodes.yaml", *size) | {"inventory/clusters.yaml": FROM_CLUSTER}
+    policy = plain_yaml.load(skeleton()[POLICY])
+    policy["domains"][0]["nodes"] = ["vehicle*", "station*", "edge", "cloud", "bus*"]
+    policy["domains"].append(
+        {"name": "b", "namespace": "b", "serviceAccount": "b", "nodes": ["*9"]}
+    )
+    changed |= {POLICY: json.dumps(policy), PATH: file}
+    config = load(configuration(changed))
+    assert [config.nodes[id].properties for id in sizes] == [{"size": 3}, {}, {}]
+    assert "bus9" in config.nodes
+    assert "bus9" not in config.domain_of, "two access domains match it"

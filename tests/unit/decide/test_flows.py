@@ -21,13 +21,13 @@ from demandops.decide.planning.planner import ReleaseKey, affected_keys, all_key
 from demandops.decide.state import rendered_files
 from demandops.decide.warnings import policy_warnings
 from demandops.model.config.config import Config
-from demandops.model.config.override import Override, OverrideFile, Selector
+from demandops.model.config.override import Override
 from demandops.model.release import ServiceKey, ServiceRelease
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
-from tests.kit.config import brokers, skeleton, state_of
+from tests.kit.config import brokers, override_of, skeleton, state_of
 from tests.kit.memory import MemoryRepo, ledger_in
 
 ROLES = ("a", "b")
@@ -298,17 +298,9 @@ def overrides(random: Random, graphs: Graphs) -> Iterator[Override]:
     """Yield random overrides, each of which moves a service, or all services of an application."""
     names = sorted({name for services in graphs.services.values() for name in services})
     for number in range(random.randint(0, 2)):
-        by_service = Selector(services=(random.choice(names),))
-        file = OverrideFile(
-            apiVersion="demandops/v1",
-            kind="Override",
-            reason="by chance",
-            owner="petra",
-            priority=number,
-            select=(random.choice([by_service, by_service, Selector(applications=("x",))]),),
-            node=random.choice(NODES),
-        )
-        yield Override.from_file(f"o{number}", file)
+        by_service = {"services": [random.choice(names)]}
+        select = random.choice([by_service, by_service, {"applications": ["x"]}])
+        yield override_of(f"o{number}", select, priority=number, node=random.choice(NODES))
 
 
 def wanted(graphs: Graphs, app: dict[str, Any], active: Iterable[Override]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Overrides: what patches make of Helm values, who is warned of ties, and what happens to pods."""
+"""Overrides: what patches make of Helm values, and who is warned of ties."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 from demandops.decide.planning.overrides import apply_effects, effects_on
-from demandops.decide.state import describe_change, planned_releases, trial_releases
+from demandops.decide.state import trial_releases
 from demandops.decide.warnings import tied_override_warnings
-from demandops.model.config.override import Override, OverrideFile
+from demandops.model.config.override import Override
 from demandops.model.release import ServiceRelease
 from demandops.templating.charts import merged, overridden
 from hypothesis import given
@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 
 from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import override
-from tests.kit.goals import put
+from tests.kit.config import override_of
 from tests.kit.memory import MemoryRepo
 
 CONFIG = MemoryRepo().config
+ALL = {"nodes": ["*"]}
 
 json = st.recursive(
     st.none() | st.booleans() | st.integers(0, 2) | st.sampled_from("xy"),
@@ -89,7 +89,7 @@ def _release() -> ServiceRelease:
 def test_a_tie_is_told_where_the_order_of_names_decides(
     one: dict[str, Any], other: dict[str, Any]
 ) -> None:
-    both = [_override(name, fields) for name, fields in (("one", one), ("other", other))]
+    both = [override_of("one", ALL, **one), override_of("other", ALL, **other)]
     first, second = (_shaped(order) for order in (both, both[::-1]))
     told = [*tied_override_warnings([first])]
     assert bool(told) is bool([*tied_override_warnings([second])])
@@ -103,14 +103,8 @@ def test_a_tie_is_told_where_the_order_of_names_decides(
 def test_overrides_are_tied_if_they_differ_in_what_both_set(
     one: dict[str, Any], other: dict[str, Any], tied: bool
 ) -> None:
-    release = _shaped([_override("one", one), _override("other", other)])
+    release = _shaped([override_of("one", ALL, **one), override_of("other", ALL, **other)])
     assert bool([*tied_override_warnings([release])]) is tied
-
-
-def _override(name: str, fields: dict[str, Any]) -> Override:
-    head = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "r", "owner": "o"}
-    file = OverrideFile.model_validate(head | {"select": [{"nodes": ["*"]}]} | fields)
-    return Override.from_file(name, file)
 
 
 def _shaped(overrides: list[Override]) -> ServiceRelease:
@@ -127,33 +121,3 @@ def _made(shaped: ServiceRelease) -> tuple[Any, ...]:
         values = overridden(values, patch, None)
     images = {name: shaped.image(name, CONFIG) for name in shaped.service.images}
     return shaped.replicas, shaped.node, shaped.shaping.held, _text(values), images
-
-
-# ---- the effect on pods ----
-
-
-FUSION = "of-edge-fusion-c9b035cdedb8"
-
-
-@pytest.mark.parametrize(
-    ("changed", "effect"),
-    [
-        ({"values": {"inputs": {"egoData": ["/other"]}}}, "reconfigures"),
-        ({"replicas": 0}, "stops"),
-        ({"values": {"inputs": {"egoData": ["/other"]}, "fusion": {"nodeName": "x"}}}, "restarts"),
-        ({"images": {"object-fusion": {"tag": "2"}}}, "restarts"),
-        ({"hold": True}, ""),
-    ],
-)
-def test_an_override_has_the_effect_of_what_it_changes(
-    changed: dict[str, Any], effect: str
-) -> None:
-    text = override({"services": ["object-fusion"]}, **changed)
-    sides = list[tuple[Any, str]]()
-    for repo in (MemoryRepo(), MemoryRepo({"overrides/test.yaml": text})):
-        repo.send(put("fusion"))
-        by_name = {release.name: release for release in planned_releases(repo.state).values()}
-        (path,) = (path for path in repo.files if path.endswith(f"/{FUSION}.yaml"))
-        sides.append((by_name[FUSION], repo.files[path]))
-    (was, current), (now, written) = sides
-    assert describe_change(was, now, current, written).effect == effect

@@ -80,23 +80,28 @@ def test_events_last_if_the_rules_are_replaced_by_the_same() -> None:
     assert [event.rule for event, _ in detector.step([at(4, "car1", 91)], 4)] == ["a"]
 
 
-def test_the_demands_of_a_rule_that_is_gone_or_for_others_end() -> None:
-    for rules in ([], [rule("a", near=NEAR, entities=["bus*"])]):
-        assert changes(started(rule("a", near=NEAR)), *rules) == {("a", ("car1",)): None}
+CHANGED = rule("a", near=NEAR, demand=demand(demand="{entity}", positions=POSITIONS))
+WANTED = {"demand": "car1", "requesters": ["car1"], "positions": [{"node": "n", "x": 80}]}
 
 
-def test_a_changed_demand_is_wanted_with_the_values_of_the_events_start() -> None:
-    changed = rule("a", near=NEAR, demand=demand(demand="{entity}", positions=POSITIONS))
-    wanted = {"demand": "car1", "requesters": ["car1"], "positions": [{"node": "n", "x": 80}]}
-    assert changes(started(rule("a", near=NEAR)), changed) == {("a", ("car1",)): wanted}
+@pytest.mark.parametrize(
+    ("rules", "wanted"),
+    [([], None), ([rule("a", near=NEAR, entities=["bus*"])], None), ([CHANGED], WANTED)],
+    ids=[
+        "the rule is gone",
+        "it is for others",
+        "it wants another demand",
+    ],
+)
+def test_what_new_rules_want_of_an_event_that_lasts(rules: list[Any], wanted: Any) -> None:
+    assert changes(started(rule("a", near=NEAR)), *rules) == {("a", ("car1",)): wanted}
 
 
 def test_a_changed_demand_is_not_wanted_without_the_values_that_a_restart_lost() -> None:
     detector = Detector(file_of(rule("a", near=NEAR)), 0)
     books = {"demands": {"a/car1": entry("r")}}
     assert detector.resume(booked_events(detector.file, books), 0, 5)
-    changed = rule("a", near=NEAR, demand=demand(demand="{entity}", positions=POSITIONS))
-    assert changes(detector, changed) == {}
+    assert changes(detector, CHANGED) == {}
 
 
 def test_an_entity_that_does_not_come_back_after_a_restart_is_gone() -> None:

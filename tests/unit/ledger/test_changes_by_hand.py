@@ -1,4 +1,4 @@
-"""What people write in Git, an upgrade and a restoration leave, and what a change says of itself.
+"""What people write in Git, an upgrade and a restoration leave.
 
 The rules for demands are in ``tests/scenarios``, ``test_flows`` and ``test_properties``.
 """
@@ -6,7 +6,6 @@ The rules for demands are in ``tests/scenarios``, ``test_flows`` and ``test_prop
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import timedelta
 from typing import Any
 
 import pytest
@@ -18,10 +17,10 @@ from demandops.decide.booking import Restoration, apply
 from demandops.decide.carriers import with_one_carrier
 from demandops.decide.edits import faults_of_edit
 from demandops.decide.planning.flows import with_booked_topics_marked
-from demandops.model.demand.demand import UNSTARTED, Demand, Item, Lease
+from demandops.model.demand.demand import UNSTARTED, Demand
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim, path_of
-from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, ledger_of
+from demandops.model.ledger.ledger import ClaimChange, ledger_of
 
 from tests.kit.config import edited, skeleton
 from tests.kit.goals import APP, CLOUD, Topic, application, connection, goal, put
@@ -195,44 +194,12 @@ def test_an_edit_by_hand_changes_what_nodes_have_left() -> None:
     assert left.usage().amounts != known.usage().amounts
 
 
-# ---- what a change of claims says about itself ----
-
-
-HELD = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
-
-
-def items_of(*requesters: str, held: Connection = HELD) -> tuple[Item, ...]:
-    return (Item(held, requesters, lease=Lease(60)),)
-
-
-def applied(ledger: Ledger, request: Demand, minutes: int = 0) -> tuple[Ledger, Changes]:
-    return apply(ledger, request, NOW + timedelta(minutes=minutes))
-
-
-def joined(ledger: Ledger, who: str = "v", **changed: Any) -> Ledger:
-    return applied(ledger, Demand("join", "r", items_of(who, held=replace(HELD, **changed))))[0]
-
-
-def test_a_renewed_lease_only_renews_and_a_shutdown_does_not() -> None:
-    ledger, new = applied(Ledger(), Demand("join", "r", items_of("v", "w")), 0)
-    ledger, again = applied(ledger, Demand("join", "r", items_of("v", "w")), 1)
-    _, less = applied(ledger, Demand("shutdown", "r", items_of("v", "w")), 2)
-    renews = [change.only_renews for changes in (new, again, less) for change in changes.claims]
-    assert renews == [False, True, False]
-
-
 def test_a_refusal_suggests_no_claims_of_overrides() -> None:
+    link = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
     demands = (f"{OVERRIDE_PREFIX}keep", "mine")
-    ledger = rebuilt(Claim(HELD, demand, "r", ("v",), NOW) for demand in demands)
+    ledger = rebuilt(Claim(link, demand, "r", ("v",), NOW) for demand in demands)
     with pytest.raises(Refused, match=r"hold, for example, mine$"):
-        applied(ledger, Demand("release", "r", (), "mien", ("v",)))
-
-
-def test_a_reverse_route_delivers_to_the_source() -> None:
-    ledger = joined(Ledger(), topics=(Route("/a", "/b"), Route("/c", "/d", reverse=True)))
-    assert ledger.ids_with("brings", "t", "/b")
-    assert ledger.ids_with("brings", "s", "/c")
-    assert not ledger.ids_with("brings", "t", "/d")
+        apply(ledger, Demand("release", "r", (), "mien", ("v",)), NOW)
 
 
 def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:

@@ -177,5 +177,10 @@ def test_a_claim_that_a_person_edited_is_read_strictly(case: dict[str, str]) -> 
     assert case["says"] in found.message
 
 
+def test_a_version_of_any_length_is_a_fault() -> None:
+    with pytest.raises(InvalidInput):
+        claim_files.read(CASES["edited"].replace("/v3", f"/v{'9' * 5000}"), CASES["path"])
+
+
 def test_half_a_character_in_a_forged_trailer_has_a_path_segment() -> None:
     assert claim_files.segment("\ud800") != claim_files.segment("\ud801")

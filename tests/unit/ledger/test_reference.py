@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from datetime import timedelta
-from itertools import permutations
 from pathlib import Path
 from typing import Any
 
-from demandops.decide.admission.completing import with_definitions
-from demandops.decide.booking import apply
-from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.ledger import Ledger
 
 from tests.kit import plain_yaml
-from tests.kit.goals import EXPERIMENT
 from tests.kit.memory import NOW, MemoryRepo
 
 ROOT = Path(__file__).parents[3]
@@ -112,42 +107,3 @@ def test_the_recorded_run_shows_every_difference_that_the_page_explains() -> Non
     assert RUN["reference"]["commit"] in page
     explained = ROW.findall(page)
     assert sorted(explained) == sorted({step["class"] for step in RUN["steps"] if "class" in step})
-
-
-def test_the_papers_table_counts_each_join_in_all_orders_of_joining_and_leaving() -> None:
-    """After all joins the ledgers are equal, so one of them stands for all before the leaves."""
-    config = MemoryRepo().config
-
-    def after(ledger: Ledger, goal: dict[str, Any]) -> Ledger:
-        return apply(ledger, with_definitions(read_goal(goal), config), NOW)[0]
-
-    goals = [plain_yaml.load(file.read_text()) for file in EXPERIMENT]
-    alone = {who_asks(goal): counted(after(Ledger(), goal)) for goal in goals[:4]}
-    whole, standing = Ledger(), dict[str, Books]()
-    for part in (goals[:4], goals[4:]):
-        ends = []
-        for order in permutations(part):
-            ledger, held = whole, dict(standing)
-            for goal in order:
-                ledger, who = after(ledger, goal), who_asks(goal)
-                if goal["shutdown"]:
-                    del held[who]
-                else:
-                    held[who] = alone[who]
-                assert counted(ledger) == united(held.values())
-            ends.append(ledger)
-        assert all(one.claims == ends[0].claims for one in ends)
-        whole, standing = ends[0], held
-    assert not len(whole)
-
-
-def who_asks(goal: dict[str, Any]) -> str:
-    return " ".join(goal["apps"][0]["object_detection_fusion_app"]["requester_ids"])
-
-
-def united(books: Iterable[Books]) -> Books:
-    found = defaultdict[str, list[str]](list)
-    for each in books:
-        for name, who in each.items():
-            found[name] += who
-    return {name: sorted(who) for name, who in found.items()}

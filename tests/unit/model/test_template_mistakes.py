@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from operator import itemgetter
 from typing import Any
 
 import pytest
@@ -15,17 +17,16 @@ from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.goals import perception
 from tests.kit.http import serving
 from tests.kit.memory import MemoryRepo
+from tests.unit.model.test_config_mistakes import APPDEF, changed
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
-APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
-CHART = "appdefs/object-detection-fusion/charts/object-detection"
-SCHEMA = f"{CHART}/values.schema.json"
+SCHEMA = "appdefs/object-detection-fusion/charts/object-detection/values.schema.json"
 LAST = skeleton()[TEMPLATE].count("\n") + 1
 """The number of the line that is appended to the template."""
 LISTED = plain_yaml.beside(__file__, "template-mistakes")
 
 
-def refused(changed: dict[str, str]) -> list[str]:
+def refused(changed: Mapping[str, str | None]) -> list[str]:
     """Send a demand that needs the template, and return the faults for which it is refused."""
     books = MemoryRepo(changed)
     before = dict(books.files)
@@ -57,15 +58,6 @@ def test_a_template_without_end_is_told(text: str, word: str) -> None:
     assert word in found
 
 
-def test_formats_of_usual_size_work() -> None:
-    used = (
-        "[{{ '%03d' % 7 }}, {{ '{:>5}'.format(1) }}, {{ 'a'.ljust(8) }}, {{ 'a' | indent(4) }}, "
-        "{{ '%s' | format(1) }}, {{ 7 % 4 }}]"
-    )
-    (found,) = appended(f"extra: {used}\n")
-    assert "('extra' was unexpected)" in found
-
-
 def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
     for name in ("other.yaml.j2", "../../../../etc/passwd", "/etc/passwd", "demandops.yaml"):
         (found,) = appended("{% include '" + name + "' %}\n")
@@ -75,27 +67,12 @@ def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
         assert not found.startswith(f"{TEMPLATE}:{LAST}: {name}; ")
 
 
-def test_every_value_that_does_not_fit_the_charts_schema_is_told() -> None:
-    text = skeleton()[TEMPLATE].replace("replicas: {{ replicas }}", "replicas: many")
-    found = refused({TEMPLATE: text.replace("{{ node.host_network }}", "maybe")})
-    assert all(one.startswith(f"{TEMPLATE}:") for one in found)
-    assert all(one.endswith(f"; fix the template or {CHART}") for one in found)
-    places = sorted(one.split(": ")[1] for one in found)
-    assert places == ["values.hostNetwork", "values.replicas"]
-
-
-def test_a_value_that_comes_from_a_parameter_names_it() -> None:
-    text = skeleton()[APPDEF].replace("\nservices:", "\nparameters: {net: {default: x}}\nservices:")
-    template = skeleton()[TEMPLATE].replace("{{ node.host_network }}", "{{ parameters.net }}")
-    (found,) = refused({TEMPLATE: template, APPDEF: text})
-    assert found.endswith(f"{CHART}, or demand another value of the parameter net")
-
-
-@pytest.mark.parametrize(("text", "above", "word"), LISTED["topics"])
-def test_a_topic_that_the_schema_or_yaml_does_not_take(text: str, above: int, word: str) -> None:
-    (found,) = refused({TEMPLATE: skeleton()[TEMPLATE].replace("{{ source_topic }}", text)})
-    assert found.startswith(f"{TEMPLATE}:{LAST - above}: ")
-    assert word in found
+@pytest.mark.parametrize("case", LISTED["edited"], ids=itemgetter("is"))
+def test_values_that_do_not_fit_are_told_with_their_lines(case: dict[str, Any]) -> None:
+    found = refused(changed({path: case[path] for path in (TEMPLATE, APPDEF) if path in case}))
+    for (line, word), one in zip(case["told"], sorted(found), strict=True):
+        assert one.startswith(f"{TEMPLATE}:{line}: " if line else f"{TEMPLATE}: values: ")
+        assert word in one
 
 
 def test_a_template_must_give_a_mapping() -> None:
@@ -143,21 +120,8 @@ def test_check_renders_all_templates_although_nobody_demands_them() -> None:
 
 
 def test_each_listed_version_is_rendered_before_anybody_asks_for_it() -> None:
-    folder = "appdefs/object-detection-fusion/charts/next"
-    next = f"    channels: {{next: {{folder: {folder}, version: 9.0.0}}}}\n"
-    chart = {
-        f"{folder}/Chart.yaml": "apiVersion: v2\nname: object-fusion\nversion: 9.0.0\n",
-        f"{folder}/values.schema.json": json.dumps({"required": ["missing"]}),
-        "registry/charts.yaml": skeleton()["registry/charts.yaml"] + next,
-    }
-    pinned = {"1.0.0": {}, "3.0.0": {"charts": {"object-fusion": "9.0.0"}}}
-    versions = {"apiVersion": "demandops/v1", "kind": "Versions"}
-    versions |= {
-        "applications": {"object-detection-fusion": {"default": "1.0.0", "versions": pinned}}
-    }
-    files = chart | {"registry/versions.yaml": json.dumps(versions)}
     with pytest.raises(InvalidInput) as invalid:
-        try_configuration(MemoryRepo(files).state)
+        try_configuration(MemoryRepo(changed(LISTED["a version"])).state)
     (found,) = invalid.value.faults
     assert found.file == "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"
     assert '"missing" is a required property' in found.message

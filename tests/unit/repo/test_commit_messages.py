@@ -53,6 +53,7 @@ def desk() -> Desk:
 
 
 FILE = Path(__file__).with_name("commit-messages.txt")
+TEXTS = plain_yaml.beside(__file__, "texts")
 CONNECTION = goals.connection(
     "station00/edge", ends=("station00", "edge"), topics=[goals.STATION_CLOUD[0]], broker=""
 )
@@ -93,7 +94,7 @@ def messages() -> Iterator[tuple[str, str]]:
     yield "a commit that puts a claim back", put_back
     long = Desk(now=NOW).join("vehicle00", application="edge/" + "fusion" * 40)
     yield "a long id", text(long).split("\n")[0]
-    full = MemoryRepo(state=state_of(load(configuration(config=FULL))))
+    full = MemoryRepo(state=state_of(load(configuration(config=TEXTS["full"]))))
     release = {"kind": "Demand", "operation": "release", "demand": "d1", "requesters": ["v"]}
     for wanted in (
         waiting("d1", "v"),
@@ -102,20 +103,6 @@ def messages() -> Iterator[tuple[str, str]]:
         release,
     ):
         yield "a demand that waits", commit_message.of_decision(full.send(wanted), "op", full.now)
-
-
-FULL = {
-    "inventory/nodes.yaml": {
-        "nodes": [{"id": "edge", "type": "edge", "cluster": "c-its", "capacity": {"cpu": 1}}]
-    },
-    "inventory/brokers.yaml": {"brokers": []},
-    "policy/access-domains.yaml": {
-        "domains": [{"name": "all", "namespace": "all", "whenFull": "wait"}]
-    },
-    "appdefs/object-detection-fusion/appdef.yaml": {
-        "services": {"object-fusion": {"requests": {"cpu": 2}}}
-    },
-}
 
 
 def waiting(demand: str, who: str) -> goals.Goal:
@@ -132,19 +119,9 @@ def test_messages_are_those_of_the_file() -> None:
     assert listing() == FILE.read_text(), f"run python -m {__name__} and review the diff"
 
 
-@pytest.mark.parametrize(
-    ("names", "wanted"),
-    [
-        (("vehicle00", "station00"), "vehicle00, station00 (requesters)"),
-        (("Ada <ada@example.org>",), "Ada (ada@example.org) (requester)"),
-        (("x" * 300,), "x" * 187 + "… (requester)"),
-        ((".",), "(requester)"),
-        (("\\",), "(requester)"),
-        (("'quoted'",), "quoted' (requester)"),
-    ],
-)
+@pytest.mark.parametrize(("names", "wanted"), TEXTS["authors"])
 def test_the_author_is_the_requesters_as_listed_and_never_a_person(
-    desk: Any, names: tuple[str, ...], wanted: str
+    desk: Any, names: list[str], wanted: str
 ) -> None:
     decision = desk.join(*names)
     who = commit_message.author(decision, desk.now)
@@ -157,7 +134,6 @@ def test_the_author_is_the_requesters_as_listed_and_never_a_person(
 # ---- a message is read back as it was written, whatever text its values have ----
 
 
-TEXTS = plain_yaml.beside(__file__, "texts")
 HOSTILE = [*TEXTS["hostile"], "\ud800", "\ud83d\ude97", "x" * 100_000]
 FORGES, ORDERS = TEXTS["forges"], TEXTS["orders"]
 VALUES = st.one_of(

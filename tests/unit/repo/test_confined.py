@@ -130,21 +130,11 @@ def test_lint_gives_errors_and_warnings_and_no_advice() -> None:
     assert "'/replicas': got string, want integer - at '/image': missing prop" in error.message
 
 
-DOMAINS = "policy/access-domains.yaml"
-KINDS = "kinds: [ConfigMap, Deployment, Secret]"
-
-
-@pytest.mark.parametrize(
-    ("field", "kind", "remedy"),
-    [
-        ("", "apps/DaemonSet", f"list DaemonSet in 'kinds' in {DOMAINS} together with all kinds"),
-        (KINDS, "apps/DaemonSet", f"add DaemonSet to 'kinds' in {DOMAINS}"),
-        (KINDS, "example.org/Robot", "add Robot, with its group and resource, to 'kinds'"),
-        ("network: namespace", "networking.k8s.io/NetworkPolicy", "remove 'network: namespace'"),
-    ],
-)
+@pytest.mark.parametrize(("field", "kind", "remedy"), SAID["kinds refused"])
 def test_what_to_do_about_a_kind(field: str, kind: str, remedy: str) -> None:
-    state = MemoryRepo(edited(DOMAINS, 'nodes: ["*"]', f'nodes: ["*"]\n    {field}')).state
+    state = MemoryRepo(
+        edited("policy/access-domains.yaml", 'nodes: ["*"]', f'nodes: ["*"]\n    {field}')
+    ).state
     release = next(one for found in trial_releases(state.config).values() for one in found)
     group, _, name = kind.partition("/")
     (fault,) = kinds_refused(Report(((group, name),)), release, state.config)

@@ -57,14 +57,7 @@ def commit_of(repo: pygit2.Repository, text: str) -> pygit2.Commit:
     return commit_log.resolve(repo, tip, text, NOW)
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("9:59:59", "at 2026-01-31 09:59:59 UTC the state repo did not exist yet; its first commit "
-         "is of 2026-01-31 10:00:00 UTC"),
-        ("domain", "'domain' is neither a commit of the state repo nor a time; write a branch"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "told"), TABLES["neither"])
 def test_neither_revision_nor_a_time_of_the_state_repo(
     repo: pygit2.Repository, text: str, told: str
 ) -> None:

@@ -95,36 +95,28 @@ def lay(repo: pygit2.Repository, files: Files) -> pygit2.Tree:
 
 
 @given(data=st.data())
-@examples(50)
-def test_writing_a_change_gives_the_tree_that_git_itself_would_write(data: st.DataObject) -> None:
+@examples(80)
+def test_a_change_gives_the_tree_that_git_would_write_and_differs_in_the_changed_files(
+    data: st.DataObject,
+) -> None:
     files = data.draw(file_trees(), "files")
     change = data.draw(changes(files), "change")
     wanted = changed(files, change)
     more = data.draw(changes(wanted), "more")
     with scratch() as repo:
-        new = NewObjects(repo)
-        made = new.add_tree(lay(repo, files) if files else None, change)
-        assert read(repo, made) == wanted
-        assert made == lay(repo, wanted).id, "the tree has an empty folder or a wrong mode"
+        new, before = NewObjects(repo), lay(repo, files)
+        made = repo[new.add_tree(before if files else None, change)].peel(pygit2.Tree)
+        assert read(repo, made.id) == wanted
+        assert made.id == lay(repo, wanted).id, "the tree has an empty folder or a wrong mode"
         for further in (more, {}):  # each starts from a tree that `new` has
-            again = new.add_tree(repo[made].peel(pygit2.Tree), further)
-            assert again == lay(repo, changed(wanted, further)).id
-
-
-@given(before=file_trees(), after=file_trees())
-@examples(50)
-def test_differences_between_trees_list_exactly_the_changed_files(
-    before: Files, after: Files
-) -> None:
-    with scratch() as repo:
-        old, new = lay(repo, before), lay(repo, after)
-        told = list(trees.differences(old, new))
-        paths = {path for path in {*before, *after} if before.get(path) != after.get(path)}
+            assert new.add_tree(made, further) == lay(repo, changed(wanted, further)).id
+        told = list(trees.differences(before, made))
+        paths = {path for path in {*files, *wanted} if files.get(path) != wanted.get(path)}
         # if a folder replaces a file, the file's removal and the folder's files are reported
         assert {path for path, _ in told} == paths
         assert len(told) == len(paths)
         for path, blob in told:
-            assert (_text(repo, blob) if blob else None) == after.get(path)
+            assert (_text(repo, blob) if blob else None) == wanted.get(path)
 
 
 def test_bytes_that_are_no_text_show_instead_of_stopping(repo: pygit2.Repository) -> None:

@@ -21,8 +21,6 @@ from demandops.templating.charts import merged
 
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, edited, skeleton
-from tests.kit.goals import application, goal
-from tests.kit.memory import MemoryRepo
 from tests.unit.templating import write
 
 APPDEF = Path(__file__).parents[3] / "appdefs" / "object-detection-fusion"
@@ -123,14 +121,6 @@ def test_the_first_of_two_imports_of_a_value_counts() -> None:
         "appdefs/lib/values.yaml": "exports:\n  first: {x: 1}\n  second: {x: 2, y: 2, own: 2}\n",
     }
     assert charts.defaults("appdefs/a", files) == {"x": 1, "y": 2, "own": 1}
-
-
-def test_a_topic_of_two_sources_is_read_once() -> None:
-    repo = MemoryRepo()
-    topics = [("/a", "vehicle01"), ("/A", "vehicle01"), ("/a", "vehicle00")]
-    repo.send(goal([application(ego=topics, clouds=[])]))
-    (release,) = repo.objects("HelmRelease").values()
-    assert release["spec"]["values"]["inputs"]["egoData"] == ["/A", "/a"]
 
 
 def test_inputs_reach_one_configmap_and_nothing_else() -> None:

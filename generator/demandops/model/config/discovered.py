@@ -48,7 +48,7 @@ _NOTE = """\
 # Written by the generator: the nodes as the cluster has them. Edits are put back. To change a node,
 # change it in the cluster, or list it in inventory/nodes.yaml, which replaces its whole entry here.
 """
-_IN_ENTRY = re.compile(r"nodes\[\d+\]\.(?!id$)(.*)")
+_IN_ENTRY = re.compile(r"(nodes\[\d+\])\.(?!id$)(.*)")
 
 
 # The value of the label `node_id`
@@ -146,11 +146,12 @@ def _of_one_kind(nodes: Mapping[str, Node], listed: Iterable[Node]) -> Iterator[
         yield id, node.model_copy(update={"properties": fitting}) if is_odd else node
 
 
-def in_entry(fault: Fault, reader: ConfigReader, clusters: Mapping[str, Cluster]) -> Fault:
+def in_entry(fault: Fault, reader: ConfigReader) -> Fault:
     """Return a fault of a discovered node at the place where people can mend it."""
     match = _IN_ENTRY.fullmatch(fault.field) if is_discovered(fault.file) else None
-    name = fault.file.rpartition("/")[2].removesuffix(".yaml")
-    if match is None or name not in clusters:
+    # the faults of an edited file, from which no node was read, are its own
+    if match is None or (fault.file, match[1]) not in reader.places[NODES_FILE].values():
         return fault
+    name = fault.file.rpartition("/")[2].removesuffix(".yaml")
     file, place = reader.places[CLUSTERS_FILE][name]
-    return replace(fault, file=file, field=f"{place}.discovery.entry.{match[1]}")
+    return replace(fault, file=file, field=f"{place}.discovery.entry.{match[2]}")

@@ -133,10 +133,17 @@ class EntryPattern(Generic[Entry]):
     def entry(self, id: str, own: Mapping[str, Any] = MappingProxyType({})) -> Entry:
         """Return the entry of an id that matches; raise ``InvalidInput`` with its faults.
 
-        The fields ``own`` are those of this id alone.
+        The fields ``own`` are those of this id alone; lists and mappings are added to the entry's.
         """
         data: Any = filled(self.data, self.values(id) or {})
-        data |= own
+        for name, value in own.items():
+            match data.get(name), value:
+                case list(listed), tuple():
+                    data[name] = [*dict.fromkeys((*listed, *value))]
+                case dict(known), dict():
+                    data[name] = known | value
+                case _:
+                    data[name] = value
         try:
             try:
                 return self.model.model_validate(data)

@@ -170,7 +170,7 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     )
     cross_check(config, reader)
     if reader.faults:
-        faults = (discovered.in_entry(each, reader, clusters) for each in reader.faults)
+        faults = (discovered.in_entry(each, reader) for each in reader.faults)
         raise InvalidInput(dict.fromkeys(faults))
     return config
 

@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from demandops.base import addresses
 from demandops.base.errors import sentences, suggestion
-from demandops.model.config import base_model
+from demandops.model.config import base_model, inventory
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel
 from demandops.model.config.inventory import Rmw
 
@@ -213,8 +213,6 @@ class ApplicationVersion:
 
 
 _EnvName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-_Quantity = Annotated[str, StringConstraints(pattern=r"^[0-9]+(\.[0-9]+)?(m|k|Ki|M|Mi|G|Gi)?$")]
-_Resource = Annotated[str, StringConstraints(pattern=r"^[a-z0-9./-]+$")]
 _LaunchFile = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]+$")]
 _Package = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*$")]
 
@@ -232,10 +230,8 @@ def _free(env: dict[str, str]) -> dict[str, str]:
 class Resources(FrozenModel):
     """What a container requests, and its limits (Kubernetes core/v1 ResourceRequirements)."""
 
-    requests: dict[_Resource, _Quantity] = Field(
-        default_factory=lambda: {"cpu": "50m", "memory": "64Mi"}
-    )
-    limits: dict[_Resource, _Quantity] = Field(default_factory=lambda: {"memory": "256Mi"})
+    requests: inventory.Resources = Field(default_factory=lambda: {"cpu": "50m", "memory": "64Mi"})
+    limits: inventory.Resources = Field(default_factory=lambda: {"memory": "256Mi"})
 
 
 class ClientSettings(CamelModel):

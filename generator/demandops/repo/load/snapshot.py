@@ -6,7 +6,8 @@ generator say so in the trailer ``Configuration``; without it, their own configu
 So a start, every reader and `demandops verify` find the same, by the history alone.
 
 The ledger is always that of the commit. A claim in it that is not valid, or that no demand could
-have booked, is put back by the generator, like a generated file that a person has edited.
+have booked, is put back by the generator, like a generated file that a person has edited, or what a
+cluster says of its nodes.
 """
 
 from __future__ import annotations
@@ -67,12 +68,15 @@ class Snapshot:
     state: State
     # the commit whose configuration is in effect; ``commit`` itself unless its own is not valid
     configuration: Oid
+    # the newest commit of a generator: what clusters say of their nodes is as it is there
+    written: Oid
     # why the configuration of ``commit`` is not in effect, and its ids, which are not judged again
     faults: tuple[Fault, ...] = ()
     refused: ConfigIds | None = None
     # the configuration that the newest commit of a generator says is not in effect
     told: ConfigIds | None = None
-    # files of claims that are not valid at ``commit`` → the claims in effect instead, and why
+    # files of claims that are not valid at ``commit`` → the claims in effect instead; and why these
+    # and other files are put back
     put_back: Mapping[str, Claim | None] = field(default_factory=dict)
     claim_faults: tuple[Fault, ...] = ()
     # whether a generator has written the files of this state; if not, all must be rendered
@@ -81,7 +85,7 @@ class Snapshot:
     @property
     def is_settled(self) -> bool:
         """Whether nothing is left to judge, to render, to put back or to tell."""
-        return self.is_rendered and not self.put_back and self.is_told
+        return self.is_rendered and not self.claim_faults and self.is_told
 
     @property
     def is_told(self) -> bool:
@@ -139,6 +143,7 @@ def load(
         commit.id,
         read.state_with(before.state if before else None, config),
         configuration,
+        commit.id,
         faults=before.faults if before and not is_own else (),
         refused=before.refused if before and not is_own else None,
         told=None if is_own else config_ids(commit.tree),
@@ -175,7 +180,9 @@ def _read_ledger(
     ledger = replace(ledger, ended=records.read_ended_override(end_markers_at(new)))
     changes, waiting = list[ClaimChange](), dict[str, str]()
     put_back = dict(before.put_back) if before else {}
-    faults = list(before.claim_faults) if before else []
+    paths = [*ledger_files.changed_files(old, new)]
+    stays = put_back.keys() - {*paths}
+    faults = [each for each in (before.claim_faults if before else ()) if each.file in stays]
     if trees.differ(old, new, (records.WAITING_ROOT,)):
         texts = trees.texts(new, (records.WAITING_ROOT,))
         ledger = replace(ledger, waiting=records.read_all_waiting(texts))
@@ -189,7 +196,6 @@ def _read_ledger(
             faults.append(fault("", "is not a valid waiting demand").within(path))
     # the second version put no claim back, and named those that were not in effect
     held_back = entry.trailers.get("Held-Back", ()) if entry else ()
-    paths = [*ledger_files.changed_files(old, new)]
     for done, path in enumerate(paths):
         if done % 200 == 0:
             progress(done, len(paths))
@@ -392,9 +398,10 @@ def follow(
     claims = trees.commit_of(repo, before.commit).tree, tree, (claim_files.LEDGER_ROOT,)
     if ids != before.refused or again or trees.differ(*claims):
         try:
-            config = _judged(tree, trees.commit_of(repo, before.commit).tree, before.state)
+            config = _judged(tree, trees.commit_of(repo, before.written).tree, before.state)
             state = replace(before.state, config=config)
-            return _carried_out(repo, before, Snapshot(to, state, to, told=before.told), now)
+            wanted = Snapshot(to, state, to, before.written, told=before.told)
+            return _carried_out(repo, before, wanted, now)
         except InvalidInput as error:
             faults = error.faults
     held = replace(before, commit=to, faults=faults, refused=ids)
@@ -426,20 +433,20 @@ _judgements: dict[object, Config | InvalidInput] = {}
 _MOST_JUDGED = 8
 
 
-def _judged(tree: Tree, earlier: Tree, before: State) -> Config:
+def _judged(tree: Tree, written: Tree, before: State) -> Config:
     """Return the configuration of people's commit if it can be used, whatever is demanded.
 
-    What clusters say of their nodes is that of the tree ``earlier``; people's edits are put back.
+    What clusters say of their nodes is that of the tree ``written``; people's edits are put back.
     """
     in_effect = before.config.repo_settings.render_version
-    of_clusters = trees.entry_id(earlier, DISCOVERED_ROOT)
+    of_clusters = trees.entry_id(written, DISCOVERED_ROOT)
     key = (config_ids(tree), of_clusters, in_effect, frozenset(before.ledger.ended.items()))
     judgement = _judgements.get(key)
     if judgement is None:
         try:
             files = trees.texts(tree, CONFIG_ROOTS)
             files = {path: text for path, text in files.items() if not is_discovered(path)}
-            files |= trees.texts(earlier, (DISCOVERED_ROOT,))
+            files |= trees.texts(written, (DISCOVERED_ROOT,))
             if ROOT_FILE not in files:
                 raise InvalidInput([fault("", NO_STATE_REPO).within(ROOT_FILE)])
             config = load_config(files)
@@ -517,11 +524,16 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
     put_back = read.put_back | {
         claim_files.path_of(change.key): change.before for change in refused
     }
+    written = trees.commit_of(repo, before.written).tree
+    of_clusters = {
+        path: trees.read_text(written, path)
+        for path, _ in trees.differences(written, tree, (DISCOVERED_ROOT,))
+        if not trees.is_readme(path)
+    }
+    edited = "is written only by the generator, as the cluster has its nodes"
+    faults += [fault("", edited).within(path) for path in of_clusters]
     files: dict[str, str | None] = {
-        **{
-            path: trees.read_text(earlier, path)
-            for path, _ in trees.differences(earlier, tree, (DISCOVERED_ROOT,))
-        },
+        **of_clusters,
         **{path: claim_files.text_of(claim) if claim else None for path, claim in put_back.items()},
         **read.waiting,
         **carried.files,

@@ -114,6 +114,7 @@ class CommitBatch:
             commit=commit,
             state=state,
             configuration=self.head.configuration if held else commit,
+            written=commit,
             told=self.head.refused if held else None,
             put_back={},
             claim_faults=(),
