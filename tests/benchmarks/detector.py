@@ -2,8 +2,7 @@
 
 The rules get poses of 5,000 entities at 10 Hz, with 100 areas, a rule on pairs and one on a count.
 The node gets poses of more and more entities at 10 Hz until it loses messages. First each entity
-has a topic of its own, then all entities share one topic. What it uses is compared with what a node
-uses that takes the same messages in the same way, and does nothing with them.
+has a topic of its own, then all entities share one topic.
 """
 
 from __future__ import annotations
@@ -85,30 +84,7 @@ def without_ros() -> None:
     )
 
 
-def alone(*topics: str) -> None:
-    """Take the messages of topics as the detector does, until a signal; print how many."""
-    import rclpy
-    from demandops_ros import ros_process
-    from demandops_ros.detector.detector_node import SourceSubscriptions, _taken
-
-    with ros_process.StopSignals() as signals, ros_process.started([]):
-        node, taken = rclpy.create_node("alone"), 0
-        file = rule_file.read(text_of(*rules()), "rules.yaml")
-        subscribing = SourceSubscriptions(node, file, lambda: 0.0)
-        subscriptions = [subscribing._subscribe(POSE, topic) for topic in topics]
-
-        def take() -> None:
-            nonlocal taken
-            taken += sum(1 for each in subscriptions for _ in _taken(each))
-
-        node.create_timer(0.1, take)
-        thread = ros_process.ExecutorThread(node)
-        signals.wait()
-        thread.close()
-        print(taken)
-
-
-def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, int, float]:
+def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
     """Return how many poses were sent over ROS and read, and the processor's seconds for it."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
@@ -120,11 +96,8 @@ def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, 
         path = Path(folder, "rules.yaml")
         path.write_text(text_of(*rules(), sources=sources))
         options = ["-p", "bookkeeping_topic:=''", "-p", f"rules:={path}"]
-        detect = ["demandops.cli.main", "detect", "--ros-args", *options]
-        command = ["tests.benchmarks.detector", *topics] if alone else detect
-        detecting = subprocess.Popen(
-            [sys.executable, "-m", *command], stderr=subprocess.DEVNULL, stdout=subprocess.PIPE
-        )
+        command = [sys.executable, "-m", "demandops.cli.main", "detect", "--ros-args", *options]
+        detecting = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         rclpy.init()
         node = rclpy.create_node("fleet")
 
@@ -136,7 +109,7 @@ def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, 
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
         publishers = [node.create_publisher(PoseStamped, topic, 1000) for topic in topics]
         message = PoseStamped()
-        while (not alone and heard.get("topics", 0) < len(topics)) or not all(
+        while heard.get("topics", 0) < len(topics) or not all(
             publisher.get_subscription_count() for publisher in publishers
         ):
             rclpy.spin_once(node, timeout_sec=0.1)
@@ -157,8 +130,8 @@ def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, 
         node.destroy_node()
         rclpy.shutdown()
         detecting.terminate()
-        printed, _ = detecting.communicate(timeout=20)
-    return sent, int(printed) if alone else heard["messages"] - before, spent
+        detecting.wait(timeout=20)
+    return sent, heard["messages"] - before, spent
 
 
 def cpu(pid: int) -> float:
@@ -170,19 +143,14 @@ def main() -> None:
     without_ros()
     for what, sources in (("a topic for each", OWN_TOPIC), ("one topic for all", ONE_TOPIC)):
         for entities in (50, 100, 200, 400, 800, 1600):
-            sent, read, spent = over_ros(entities, sources, alone=False)
-            _, taken, spent_alone = over_ros(entities, sources, alone=True)
-            each, each_alone = spent / read * 1e6, spent_alone / taken * 1e6
-            print(
-                f"node, {what}: {entities} entities at {HZ} Hz: {read / sent:.1%} of {sent} "
-                f"messages read, {spent / ROS_SECONDS:.0%} of a core; {each:.0f} us for a message, "
-                f"{each / each_alone:.2f} times as much as to take it alone",
-                flush=True,
-            )
+            sent, read, spent = over_ros(entities, sources)
+            used = f"{spent / ROS_SECONDS:.0%} of a core; {spent / read * 1e6:.0f} us for a message"
+            share = f"{read / sent:.1%} of {sent} messages read"
+            print(f"node, {what}: {entities} entities at {HZ} Hz: {share}, {used}", flush=True)
             if read < 0.99 * sent:
                 break
 
 
 if __name__ == "__main__":
     os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
-    alone(*sys.argv[1:]) if sys.argv[1:] else main()
+    main()

@@ -67,9 +67,11 @@ def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
     name = random.choice([path for path in files if path.startswith(("inventory", "registry"))])
     data = _yaml(files[name])
     renamed = {old: random.choice(texts) for old in ("vehicle00", "edge") if random.random() < 0.3}
-    for holder, key in _strings(data) + _strings(goal):
-        if random.random() < 0.05:
-            holder[key] = random.choice(texts)
+    for document in (data, goal):
+        for *above, key in [*forms.places(document)]:
+            holder = forms.at(document, tuple(above))
+            if isinstance(holder[key], str) and random.random() < 0.05:
+                holder[key] = random.choice(texts)
     files[name] = yaml.safe_dump(data, allow_unicode=True)
     for old, new in renamed.items():  # an id is renamed everywhere
         goal = _renamed(goal, old, new)
@@ -83,17 +85,6 @@ def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
 
 def _renamed(data: Any, old: str, new: str) -> Any:
     return json.loads(json.dumps(data).replace(json.dumps(old), json.dumps(new)))
-
-
-def _strings(data: Any) -> list[tuple[Any, Any]]:
-    """Return the holder and the key of each text in a document."""
-    found: list[tuple[Any, Any]] = []
-    for key, value in list(data.items() if isinstance(data, dict) else enumerate(data)):
-        if isinstance(value, str):
-            found.append((data, key))
-        elif isinstance(value, dict | list):
-            found += _strings(value)
-    return found
 
 
 def rendered_file(given: tuple[dict[str, str], Any]) -> None:

@@ -20,8 +20,8 @@ from tests.kit.config import texts_below
 from tests.kit.goals import connection, goal
 from tests.kit.repo import GitRepo
 from tests.model.goals import DemandMaker, Words
-from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
 from tests.model.listed import Goal
+from tests.model.running import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
 from tests.model.view import key_in_ledger
 from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World

@@ -25,9 +25,8 @@ from demandops.serve.journal import Ticket
 from tests.kit import plain_yaml
 from tests.model import books, view
 from tests.model.goals import SKELETON
-from tests.model.instances import FURTHER, NEXT
 from tests.model.listed import Goal, Subject
-from tests.model.running import Link, Override, Running, Service
+from tests.model.running import FURTHER, NEXT, Link, Override, Running, Service
 from tests.simulation.world import Machine, World
 
 SLACK_S = 30
