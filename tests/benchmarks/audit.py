@@ -24,7 +24,6 @@ BATCH = 500
 
 
 def lay_down(folder: Path) -> Path:
-    """Make a state repo with a fleet, and carry out the goals there; return its path."""
     edges = fleet.edges_for(RELEASES)
     laid = fleet.lay_down(folder / "state-repo.git", edges)
     with fleet.no_fsync(), closing(Generator(str(laid), data=folder / "data")) as generator:

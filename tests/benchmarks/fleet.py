@@ -135,7 +135,6 @@ def costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
 
 
 def workspace() -> TemporaryDirectory[str]:
-    """Return a folder for state repos, on the disk of the checkout."""
     BUILD.mkdir(exist_ok=True)
     return TemporaryDirectory(prefix="bench-", dir=BUILD)
 

@@ -77,7 +77,6 @@ def calls_of(trait: str) -> frozenset[str]:
 
 
 def file_class(path: str, root: Path) -> str:
-    """Return the class of a file: its path below ``root`` without the parts that vary."""
     name = path.removeprefix(f"{root}/")
     for pattern, stands in _RANDOM:
         name = pattern.sub(stands, name)

@@ -48,7 +48,6 @@ def requests_of(case: str) -> list[Path]:
 
 
 def start(case: str) -> tuple[State, dict[str, str]]:
-    """Return the state before the first request, and the files generated from it."""
     state = MemoryRepo(texts_below(GOLDEN / case / "state-repo")).state
     return state, rendered_files(state)
 
@@ -64,7 +63,6 @@ def play(case: str) -> Iterator[tuple[str, MemoryRepo]]:
 
 @lru_cache
 def rendered(case: str) -> Mapping[str, Files]:
-    """Return all generated files after each step."""
     return {name: dict(repo.files) for name, repo in play(case)}
 
 
@@ -91,7 +89,6 @@ def to_store(case: str) -> dict[str, dict[str, str]]:
 
 
 def _base(case: str, step: str, before: Files) -> dict[str, str]:
-    """Return the files to which a step's stored change is applied."""
     if case == EXPERIMENT or (step != START and case not in FOLLOWING):
         return dict(before)
     steps: dict[str, Files] = {"": {}, **rendered(EXPERIMENT)}

@@ -85,7 +85,6 @@ class Books:
         return "released" if gives_up else "booked"
 
     def of(self, demand: str) -> dict[Subject, Claim]:
-        """Return the claims of a ``Demand``."""
         return {key[0]: claim for key, claim in self.claims.items() if key[1] == (demand, ())}
 
     def on(self, kind: str) -> list[tuple[str, Claim]]:

@@ -343,5 +343,4 @@ class DemandMaker:
 
 
 def ended(put: Goal, operation: str) -> Goal:
-    """Return the release or renewal of a demand by its requesters."""
     return {name: put[name] for name in ("kind", "demand", "requesters")} | {"operation": operation}

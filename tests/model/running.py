@@ -126,7 +126,6 @@ class Running(Places):
         return routes
 
     def _chosen(self, app: dict[str, Any], who: list[str]) -> dict[str, Any]:
-        """Return ``app`` with the id, node and version for its claim."""
         asked = app["version"]
         version = self.testing if asked == "testing" else asked or DEFAULT
         asked = asked and version  # a claim records the version, not the channel
@@ -147,7 +146,6 @@ class Running(Places):
         return app | {"id": id, "node": node, "version": asked}
 
     def demanded(self) -> dict[Instance, frozenset[str]]:
-        """Return the topics that the demands for each instance list."""
         found: dict[Instance, frozenset[str]] = {}
         for id, claim in self.on("application"):
             if claim.fixed["type"] == TALLY:

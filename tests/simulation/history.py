@@ -63,8 +63,6 @@ def template() -> Path:
 
 
 class History:
-    """A random history of a world: demands, crashes, network faults and people's commits."""
-
     def __init__(self, world: World) -> None:
         self.world, self.oracle = world, Oracle(world)
         self.chance, self.turns = world.turns.chance, world.turns
@@ -307,7 +305,6 @@ class History:
         self._commit({path: plain_yaml.dump(file)})
 
     def _changed(self, path: str, change: Callable[[Any], object]) -> str:
-        """Commit a change of a file's data; return the commit's id."""
         data = plain_yaml.load(self.repo.files(path)[path])
         change(data)
         return self._commit({path: plain_yaml.dump(data)})

@@ -73,8 +73,6 @@ class Asked:
 
 
 class Oracle:
-    """Fails if the model does not allow a commit of main or an answer."""
-
     def __init__(self, world: World) -> None:
         self.world = world
         self.asked: dict[str, Asked] = {}
@@ -218,7 +216,6 @@ class Oracle:
         return {subject: claim.content() for subject, claim in held.items()}
 
     def key_of(self, key: view.Key) -> books.Key:
-        """Return the model's key of a claim of the ledger."""
         return next(one for one in self.books.claims if view.key_of(one) == key)
 
     def _take(self, books: Running, asked: Asked, time: float) -> str:
@@ -407,7 +404,6 @@ def _assert_same(commit: pygit2.Commit, found: object, expected: object) -> None
 
 
 def _overrides(commit: pygit2.Commit) -> tuple[list[Override], set[str]]:
-    """Return the overrides of a commit, and the names of those that have ended."""
     found = [
         Override.read(Path(path).stem, plain_yaml.load(text))
         for path, text in trees.texts(commit.tree, ["overrides"]).items()
