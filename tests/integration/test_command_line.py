@@ -12,28 +12,12 @@ import sys
 from pathlib import Path
 
 import pytest
-import yaml
 from demandops.base.errors import Unsound
 from demandops.cli.queries import commits
 
 from tests.integration.conftest import On
-from tests.kit.cli import Ran, Run
-from tests.kit.goals import perception
+from tests.kit.cli import Ran
 from tests.kit.repo import git
-
-GIVEN = yaml.safe_dump(perception())
-
-
-@pytest.mark.parametrize("command", ["bookkeeping", "request -"])
-def test_a_password_in_an_address_is_refused_and_not_shown(
-    demandops: Run, data_home: Path, command: str
-) -> None:
-    url = "https://somebody:hunter2@127.0.0.1:1/x.git?hunter2"
-    ran = demandops("-v", *command.split(), "--state-repo", url, stdin=GIVEN)
-    assert (ran.code, ran.out) == (1, "")
-    assert "holds a password or token" in ran.err and "hunter2" not in ran.err
-    files = [path for path in data_home.rglob("*") if path.is_file()]
-    assert not [path for path in files if "hunter2" in f"{path} {path.read_text()}"]
 
 
 @pytest.mark.parametrize(

@@ -6,19 +6,13 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import rclpy
 import yaml
-from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
-from demandops_interfaces.action import Demand
 from demandops_interfaces.msg import Bookkeeping
 from demandops_ros import DemandClient, DemandError
-from rclpy.action import ActionClient
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
 from tests.kit import plain_yaml
@@ -27,7 +21,7 @@ from tests.kit.goals import EXPERIMENT
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import git, tip
 from tests.kit.rig import wait_until
-from tests.kit.ros import Served
+from tests.kit.ros import Client, Served
 
 REFUSED = plain_yaml.load(Path(__file__).with_name("refused.yaml").read_text())
 POINTS = "/vehicles/vehicle00/drivers/lidar/pointcloud"
@@ -58,20 +52,6 @@ def operations(served: Served, since: str) -> list[str]:
 def before(shared: Served) -> str:
     """The newest commit of the shared node's state repo when the test begins."""
     return tip(shared.state_repo)
-
-
-@pytest.fixture
-def raw(shared: Served) -> Iterator[SingleThreadedExecutor]:
-    """An executor with a ROS node of its own, in the ROS domain of the shared node."""
-    context = rclpy.Context()
-    rclpy.init(context=context, domain_id=shared.domain)
-    executor = SingleThreadedExecutor(context=context)
-    node = rclpy.create_node("raw", context=context)
-    executor.add_node(node)
-    yield executor
-    executor.shutdown(timeout_sec=1)
-    node.destroy_node()
-    context.try_shutdown()
 
 
 def test_a_third_type_of_application_is_demanded_with_yaml_alone(
@@ -117,19 +97,6 @@ def test_every_field_is_in_the_message_and_named_in_a_refusal(
     assert topics == {"/refused/a": ["vehicle00"], "/refused/b": ["vehicle00"]}
 
 
-def test_services_run_where_the_message_says(shared: Served, vehicle: DemandClient) -> None:
-    place = {"role": "cloud", "labels": ["node_id=cloud"], "capabilities": []}
-    placed = RECORDER | {"id": "placed", "node": "", "place": place}
-    apart = RECORDER | {"id": "apart", "services": {"recorder": "cloud"}}
-    for item, driver in ((placed, "vehicle00"), (apart, "vehicle00")):
-        assert vehicle.put("where", [item]).outcome == "booked"
-        found = [one for one in shared.bookkeeping()["services"].values()
-                 if one["applications"] == [item["id"]]]  # fmt: skip
-        on = {one["service"]: one["node"] for one in found}
-        assert on == {"recorder": "cloud", "driver": driver}
-    assert vehicle.release("where").outcome == "released"
-
-
 def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(
     shared: Served, vehicle: DemandClient, before: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,23 +115,6 @@ def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(
     assert operations(shared, before) == ["put"]
 
 
-def test_numbers_that_the_message_does_not_define_are_refused_with_their_field(
-    raw: SingleThreadedExecutor,
-) -> None:
-    action = ActionClient(raw.get_nodes()[0], Demand, DEFAULT_DEMAND_ACTION_NAME)
-    assert action.wait_for_server(60)
-    goal = Demand.Goal(operation=7, demand_id="d", requester_ids=["r"], answer=9)
-    sent = action.send_goal_async(goal)
-    raw.spin_until_future_complete(sent, 60)
-    done = sent.result().get_result_async()
-    raw.spin_until_future_complete(done, 60)
-    result = done.result().result
-    action.destroy()
-    assert result.code == "invalid"
-    fields = [line.split(": ")[1] for line in result.message.split("\n")]
-    assert {"operation", "answer"} <= set(fields)
-
-
 def test_a_held_demand_is_renewed_and_put_again_if_it_has_ended(
     shared: Served, vehicle: DemandClient, before: str
 ) -> None:
@@ -175,19 +125,12 @@ def test_a_held_demand_is_renewed_and_put_again_if_it_has_ended(
         wait_until(lambda: held.commit != first, "the demand is put again")
 
 
-def test_the_bookkeeping_is_published_and_latched(
-    vehicle: DemandClient, raw: SingleThreadedExecutor
-) -> None:
+def test_the_bookkeeping_is_published_and_latched(vehicle: DemandClient, caller: Client) -> None:
     commit = vehicle.put("latched", connections=[link("latched")]).commit
     heard: list[Any] = []
     qos = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-    raw.get_nodes()[0].create_subscription(Bookkeeping, "/demandops/bookkeeping", heard.append, qos)
-
-    def is_latched() -> bool:
-        raw.spin_once(0.1)
-        return any(message.commit == commit for message in heard)
-
-    wait_until(is_latched, "the commit's bookkeeping is latched")
+    caller.node.create_subscription(Bookkeeping, "/demandops/bookkeeping", heard.append, qos)
+    caller.wait(lambda: any(message.commit == commit for message in heard))
     books = json.loads(heard[-1].bookkeeping_json)
     assert books["commit"] == commit and "latched" in books["connections"]
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 from application_manager_interfaces.action import DeploymentRequest
 from application_manager_interfaces.msg import Application, Connection
+from demandops.base.errors import Refused
 from demandops.model.demand.goals import read_goal
+from demandops_interfaces.action import Demand
 from demandops_interfaces.srv import GetBookkeeping
 from demandops_ros.messages import demand_goal_from_data, demand_goal_to_data, fill_message
 
@@ -48,6 +50,13 @@ def test_a_message_carries_every_field_of_a_demand() -> None:
     goal = forms.own_goal()
     carried = read_goal(demand_goal_to_data(demand_goal_from_data(goal)))
     assert carried.demanded == read_goal(goal).demanded
+
+
+def test_numbers_that_the_message_does_not_define_are_faults_of_their_fields() -> None:
+    goal = Demand.Goal(operation=7, demand_id="d", requester_ids=["r"], answer=9)
+    with pytest.raises(Refused) as refused:
+        read_goal(demand_goal_to_data(goal))
+    assert {"operation", "answer"} <= {fault.field for fault in refused.value.faults}
 
 
 def test_a_value_that_a_message_cannot_carry_is_refused_before_it_is_sent() -> None:

@@ -1,11 +1,19 @@
-"""The layout of the packages, and the launch files of ROS, which no test here can run."""
+"""The layout of the packages, the launch files of ROS, which no test here can run, and the tests.
+
+Every test that the documentation names exists, and a make target runs every test file.
+"""
 
 from __future__ import annotations
 
+import os
 import re
+import shlex
 import subprocess
 import sys
 from collections import defaultdict
+from functools import lru_cache
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -16,7 +24,11 @@ import pytest
 import yaml
 from demandops.cli import main
 
+from tests.integration import test_stories
+from tests.integration.repo.test_stories import STORIES
 from tests.kit.limits import PATIENCE_S
+from tests.scenarios import running
+from tests.simulation.faults import FAULTS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -160,3 +172,67 @@ def test_the_process_with_limits_starts_without_what_is_slow_or_to_be_kept() -> 
     names = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
     others = ("pydantic", "pygit2", "kubernetes", "demandops.model", "demandops.repo")
     assert {*others, "demandops.base.runtime"}.isdisjoint(names)
+
+
+# ---- the tests ----
+
+
+ROOT = Path(__file__).parents[2]
+NAMED = re.compile(r"`(tests/[\w/]+\.py)::([\w:]+)(?:\[([^\]`]+)\])?`")
+
+
+@pytest.mark.parametrize("page", ["reliability", "threat-model"])
+def test_a_test_that_a_page_names_exists(page: str) -> None:
+    named = NAMED.findall((ROOT / "docs" / f"{page}.md").read_text())
+    assert len(named) > 20
+    for file, name, _ in named:  # of a method, also its class
+        text = (ROOT / file).read_text()
+        assert all(re.search(rf"(def|class) {part}\b", text) for part in name.split("::")), name
+    assert {case for _, _, case in named} - {""} <= {
+        *running.scenarios(),
+        *STORIES,
+        *test_stories.STORIES,
+        *FAULTS,
+    }
+
+
+def test_each_function_on_the_path_of_a_demand_exists() -> None:
+    page = (ROOT / "ARCHITECTURE.md").read_text()
+    path = re.findall(r"^\|[^|]*\| `([\w.]+)` \| `([\w.]+)` \|", page, re.MULTILINE)
+    assert len(path) > 30
+    for function, module in path:
+        assert callable(attrgetter(function)(import_module(module)))
+
+
+TEST_FILES = sorted((ROOT / "tests").rglob("test_*.py"))
+PROCESSES = ("test-processes", "test-packages", "page", "docs", "simulate", "faults")
+TARGETS = ("test", *PROCESSES, "e2e")  # e2e-argocd runs the files of e2e, by another marker
+
+
+@lru_cache
+def files_run_by(target: str) -> frozenset[Path]:
+    environment = {name: value for name, value in os.environ.items() if "MAKE" not in name}
+    printed = subprocess.run(
+        ["make", "--dry-run", "--no-print-directory", target],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.replace("\\\n", " ")
+    (call,) = [line for line in printed.splitlines() if " -m pytest " in line]
+    words = shlex.split(call.replace("--ignore ", "--ignore="))
+    ignored = [ROOT / word.removeprefix("--ignore=") for word in words if "--ignore=" in word]
+    named = [ROOT / word for word in words if word.startswith("tests")]
+    assert all(path.exists() for path in (*named, *ignored))
+    return frozenset(
+        file
+        for file in TEST_FILES
+        if any(file.is_relative_to(path) for path in named)
+        and not any(file.is_relative_to(path) for path in ignored)
+    )
+
+
+def test_every_test_file_is_run() -> None:
+    run = frozenset[Path]().union(*map(files_run_by, TARGETS))
+    assert [str(file.relative_to(ROOT)) for file in TEST_FILES if file not in run] == []

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from demandops.base.errors import StateRepoError
-from demandops.cli.main import run
 from demandops.serve import agenda, approvals
 from demandops.serve.generator import Generator
 
@@ -80,23 +77,6 @@ def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
             rig.receipt(unlucky)
     assert Proposed(generator, goal(2), "op-3").branch in branches(bare)
     assert refused.future.done() and not waiting.future.done()
-
-
-def test_a_lease_counts_from_the_merge(bare: Path, petra: Person, generator: Generator) -> None:
-    proposed = Proposed(generator, put("d", 1, lease=600))
-    git(bare, "clone", "--quiet", "--branch", proposed.branch, str(bare), str(petra.folder))
-    assert run(["check", str(petra.folder)]) == 0
-    [path] = petra.folder.glob("ledger/applications/*/*/*.yaml")
-    no_end = {"seconds": 600, "slack": 30}
-    assert yaml.safe_load(path.read_text())["lease"] == no_end
-    petra.merge(proposed.branch)
-    receipt = rig.receipt(proposed.ticket)
-    assert (receipt.outcome, receipt.lease_s) == ("booked", 600)
-    (claim,) = generator.snapshot.state.ledger.application_claims("edge/d")
-    followed = datetime.fromisoformat(git(bare, "log", "-1", "--format=%cI", "main"))
-    assert claim.lease and claim.lease.expires_at is not None
-    assert claim.lease.expires_at - followed > timedelta(seconds=600)
-    assert rig.commits(bare)[-1].one("Operation") == "follow"
 
 
 # ---- what the server is told, and what it tells ----

@@ -55,20 +55,6 @@ def test_what_was_answered_without_a_commit_is_not_booked_after_a_power_loss(
     assert rig.claims(bare) == []
 
 
-# ---- what a kill leaves lying about ----
-
-
-def test_a_branch_lock_left_by_a_killed_generator_does_not_stop_the_next_one(bare: Path) -> None:
-    """libgit2 creates main.lock while it syncs the branch; a kill at that time leaves it."""
-    lock = bare / "refs" / "heads" / "main.lock"
-    lock.touch()
-    an_hour_ago = lock.stat().st_mtime - 3600
-    os.utime(lock, (an_hour_ago, an_hour_ago))  # makes the lock stale
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-    rig.assert_sound(bare)
-
-
 # ---- journals of dead processes ----
 
 

@@ -124,17 +124,6 @@ def test_a_shared_repository_stays_shared(
     rig.assert_sound(bare)
 
 
-@pytest.mark.parametrize("hook", ["pre-receive", "update"])
-def test_a_hook_refuses_a_demand_in_its_own_words(bare: Path, demandops: Run, hook: str) -> None:
-    file = rig.hook(bare, hook, "echo 'frozen until Monday, ask Ada' >&2; exit 1")
-    before = tip(bare)
-    ran = demandops("request", EXPERIMENT[0], "--state-repo", bare)
-    assert (ran.code, tip(bare)) == (1, before)
-    assert "frozen until Monday, ask Ada" in ran.err
-    file.chmod(0o644)  # git runs no such file
-    assert demandops("request", EXPERIMENT[0], "--state-repo", bare).code == 0
-
-
 @pytest.mark.parametrize("hook", ["post-receive", "post-update", "reference-transaction"])
 @pytest.mark.parametrize("folder", ["hooks", "our-own"])
 def test_a_hook_learns_of_each_commit(bare: Path, demandops: Run, hook: str, folder: str) -> None:

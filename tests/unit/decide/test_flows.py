@@ -34,8 +34,7 @@ ROLES = ("a", "b")
 TYPES = ("one", "two")
 SOURCES = ("vehicle00", "vehicle01", "edge")
 NODES = ("edge", "cloud", "vehicle01")
-CLUSTER_NODE = "cloud"
-"""The node of the services that run once for the cluster."""
+CLUSTER_NODE = "cloud"  # of the services that run once for the cluster
 
 
 class Origin(NamedTuple):

@@ -40,8 +40,7 @@ def test_a_file_that_a_person_broke_holds_nothing(change: dict[str, Any]) -> Non
 
 # ---- what leaves a drained node ----
 
-FREE = ("edge", "vehicle01")
-"""The nodes with a GPU, beside the drained node ``cloud``."""
+FREE = ("edge", "vehicle01")  # the nodes with a GPU, beside the drained node `cloud`
 
 
 def on_cloud(count: int, *stuck: int) -> MemoryRepo:

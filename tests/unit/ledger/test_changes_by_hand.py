@@ -8,18 +8,15 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import pytest
 import yaml
-from demandops.base.errors import Refused
-from demandops.connections.connection import Connection, Route
-from demandops.connections.mqtt import MQTT
-from demandops.decide.booking import Restoration, apply
+from demandops.connections.connection import Connection
+from demandops.decide.booking import Restoration
 from demandops.decide.carriers import with_one_carrier
 from demandops.decide.edits import faults_of_edit
 from demandops.decide.planning.flows import with_booked_topics_marked
-from demandops.model.demand.demand import UNSTARTED, Demand
+from demandops.model.demand.demand import UNSTARTED
 from demandops.model.ledger import claim as claim_files
-from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim, path_of
+from demandops.model.ledger.claim import Claim, path_of
 from demandops.model.ledger.ledger import ClaimChange, ledger_of
 
 from tests.kit.config import edited, skeleton
@@ -192,14 +189,6 @@ def test_an_edit_by_hand_changes_what_nodes_have_left() -> None:
     left = known.with_ledger(ledger.without(gone), [ClaimChange(gone[0], None)])
     assert left.usage().amounts == replace(known, ledger=left.ledger).usage().amounts
     assert left.usage().amounts != known.usage().amounts
-
-
-def test_a_refusal_suggests_no_claims_of_overrides() -> None:
-    link = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
-    demands = (f"{OVERRIDE_PREFIX}keep", "mine")
-    ledger = rebuilt(Claim(link, demand, "r", ("v",), NOW) for demand in demands)
-    with pytest.raises(Refused, match=r"hold, for example, mine$"):
-        apply(ledger, Demand("release", "r", (), "mien", ("v",)), NOW)
 
 
 def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:

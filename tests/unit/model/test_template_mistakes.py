@@ -21,8 +21,7 @@ from tests.unit.model.test_config_mistakes import APPDEF, changed
 
 TEMPLATE = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 SCHEMA = "appdefs/object-detection-fusion/charts/object-detection/values.schema.json"
-LAST = skeleton()[TEMPLATE].count("\n") + 1
-"""The number of the line that is appended to the template."""
+LAST = skeleton()[TEMPLATE].count("\n") + 1  # the line that is appended to the template
 LISTED = plain_yaml.beside(__file__, "template-mistakes")
 
 

@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 import pygit2
 import pytest
@@ -29,60 +28,26 @@ from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo
 from tests.kit.repo import git
 from tests.scenarios.running import configuration
+from tests.unit.demand.test_refused import demand_of
 
 NOW = datetime(2026, 3, 1, 12, 0, 7, tzinfo=timezone.utc)
 
 
-class Desk(MemoryRepo):
-    """A repo in memory, with a short method that sends a join for one application."""
-
-    def join(
-        self,
-        *requesters: str,
-        id: str = "intersection",
-        application: str = "edge/fusion",
-        cloud: str = "/stations/station00/pointcloud",
-    ) -> Decision:
-        app = goals.application(application, who=requesters, clouds=[(cloud, "station00")])
-        return self.send(goals.goal([app], id=id))
-
-
-@pytest.fixture
-def desk() -> Desk:
-    return Desk(now=NOW)
+def join(*requesters: str, id: str = "intersection", application: str = "edge/fusion") -> Decision:
+    app = goals.application(application, who=requesters, clouds=[goals.STATION_CLOUD])
+    return MemoryRepo(now=NOW).send(goals.goal([app], id=id))
 
 
 FILE = Path(__file__).with_name("commit-messages.txt")
 TEXTS = plain_yaml.beside(__file__, "texts")
-CONNECTION = goals.connection(
-    "station00/edge", ends=("station00", "edge"), topics=[goals.STATION_CLOUD[0]], broker=""
-)
 
 
 def messages() -> Iterator[tuple[str, str]]:
     """Yield the text of each kind of commit, with what it is for."""
-
-    def text(decision: Decision) -> str:
-        return commit_message.of_decision(decision, "op-1", NOW)
-
-    yield "a join with a warning", text(Desk(now=NOW).join("vehicle00", "station00"))
-    desk = Desk(now=NOW)
-    desk.join("vehicle00")
-    more = desk.join("vehicle00", cloud="/stations/station00/rear")
-    yield "a join that changes a release", text(more)
-    same = desk.join("vehicle01", cloud="/stations/station00/rear")
-    yield "a join that changes nothing", text(same)
-    app = goals.application("edge/fusion", clouds=[])
-    goal = goals.goal([app], [CONNECTION], id="intersection", shutdown=True)
-    desk = Desk(now=NOW)
-    desk.join("vehicle00")
-    yield "a shutdown that lists what was not held", text(desk.send(goal))
-    some = goals.application("edge/fusion", clouds=[("/stations/station00/rear", "station00")])
-    desk = Desk(now=NOW)
-    desk.join("vehicle00")
-    desk.join("vehicle00", cloud="/stations/station00/rear")
-    goal = goals.goal([some], [], id="intersection", shutdown=True)
-    yield "a shutdown of a topic", text(desk.send(goal))
+    for title, demands in TEXTS["messages"].items():
+        desk = MemoryRepo(now=NOW)
+        *_, decision = [desk.send(demand_of(one)) for one in demands]
+        yield title, commit_message.of_decision(decision, "op-1", NOW)
     releases = [ReleaseChange("of-edge", "object-fusion on edge", "", "change", ("- replicas 1",))]
     problems = [fault("nodes[0].id", "appears twice; remove one").within("inventory/nodes.yaml")]
     ids, how = ("c" * 40, "b" * 40), "correct the files, or undo the commits: git revert cccc"
@@ -92,8 +57,8 @@ def messages() -> Iterator[tuple[str, str]]:
     yield "a commit that follows one whose configuration is not valid", held
     put_back = commit_message.of_follow([], *ids, "", problems, "")
     yield "a commit that puts a claim back", put_back
-    long = Desk(now=NOW).join("vehicle00", application="edge/" + "fusion" * 40)
-    yield "a long id", text(long).split("\n")[0]
+    long = join("vehicle00", application="edge/" + "fusion" * 40)
+    yield "a long id", commit_message.of_decision(long, "op-1", NOW).split("\n")[0]
     full = MemoryRepo(state=state_of(load(configuration(config=TEXTS["full"]))))
     release = {"kind": "Demand", "operation": "release", "demand": "d1", "requesters": ["v"]}
     for wanted in (
@@ -121,14 +86,14 @@ def test_messages_are_those_of_the_file() -> None:
 
 @pytest.mark.parametrize(("names", "wanted"), TEXTS["authors"])
 def test_the_author_is_the_requesters_as_listed_and_never_a_person(
-    desk: Any, names: list[str], wanted: str
+    names: list[str], wanted: str
 ) -> None:
-    decision = desk.join(*names)
-    who = commit_message.author(decision, desk.now)
+    decision = join(*names)
+    who = commit_message.author(decision, NOW)
     assert who.name == wanted
     demand = decision.changes.claims[0].key.demand
     assert who.email == f"{demand}@requester.demandops.invalid"
-    assert (who.time, who.offset) == (int(desk.now.timestamp()), 0)
+    assert (who.time, who.offset) == (int(NOW.timestamp()), 0)
 
 
 # ---- a message is read back as it was written, whatever text its values have ----
@@ -219,14 +184,14 @@ IDS = st.one_of(
 @given(names=st.lists(IDS, min_size=1, max_size=3, unique=True), request=IDS, application=IDS)
 @examples(30)
 def test_every_id_is_read_back_by_git_and_by_us_as_it_was(
-    desk: Any, repo: pygit2.Repository, names: list[str], request: str, application: str
+    repo: pygit2.Repository, names: list[str], request: str, application: str
 ) -> None:
-    decision = type(desk)().join(*names, id=request, application=application)
-    text = commit_message.of_decision(decision, "op-1", desk.now)
-    who = commit_message.author(decision, desk.now)
+    decision = join(*names, id=request, application=application)
+    text = commit_message.of_decision(decision, "op-1", NOW)
+    who = commit_message.author(decision, NOW)
     assert who.name.strip() and len(who.name) <= 200
     tree = repo.TreeBuilder().write()
-    committer = commit_message.generator_signature(desk.now)
+    committer = commit_message.generator_signature(NOW)
     commit = repo.create_commit(None, who, committer, text, tree, [])
     ours = commit_log.entry_of(repo[commit].peel(pygit2.Commit)).trailers
     assert ours["Requester"] == names

@@ -28,8 +28,7 @@ from tests.kit.memory import MemoryRepo
 FOLDER = "appdefs/object-detection-fusion"
 TEMPLATE = f"{FOLDER}/values/object-detection.yaml.j2"
 ENDLESS = "{% for a in range(9999) %}" * 3 + "{% endfor %}" * 3
-SECONDS = 0.1
-"""How long an evaluation may take here, so that what never ends costs little."""
+SECONDS = 0.1  # for an evaluation here, so that what never ends costs little
 
 
 def values(
