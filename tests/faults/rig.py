@@ -31,7 +31,7 @@ from demandops.base.runtime import Runtime
 
 from tests.faults.trace import Call, file_class, parse
 from tests.kit.goals import numbered
-from tests.kit.repo import NO_GIT_CONFIG, commits, git
+from tests.kit.repo import NO_GIT_CONFIG, commits
 
 LIMIT_S = 8.0
 """How many seconds a process that books a demand has until SIGTERM; it needs half a second."""
@@ -333,7 +333,3 @@ def commits_by_demand(rig: Rig) -> dict[int, list[str]]:
         if name.startswith("demand-"):
             found.setdefault(int(name.removeprefix("demand-")), []).append(commit.id)
     return found
-
-
-def includes(rig: Rig, commit: str) -> bool:
-    return commit in git(rig.state, "rev-list", "main").split()

@@ -85,7 +85,7 @@ def _folder() -> Path:
 
 
 @cache
-def _repo() -> pygit2.Repository:
+def bare_repo() -> pygit2.Repository:
     repo = pygit2.init_repository(str(_folder() / "repo.git"), bare=True, initial_head="main")
     who = pygit2.Signature("x", "x@example.org", 0, 0)
     repo.create_commit("refs/heads/main", who, who, "x", repo.TreeBuilder().write(), [])
@@ -280,7 +280,7 @@ def journal_line(data: bytes) -> None:
 
 
 def commit(data: bytes) -> None:
-    repo = _repo()
+    repo = bare_repo()
     head = f"tree {repo.head.peel(pygit2.Tree).id}\n".encode()
     try:
         oid = repo.write(pygit2.enums.ObjectType.COMMIT, head + data)
@@ -300,7 +300,7 @@ def address(data: bytes) -> None:
 
 
 def revision(data: bytes) -> None:
-    repo = _repo()
+    repo = bare_repo()
     commit_log.resolve(repo, repo.head.target, _text(data), NOW)
     commit_log.parse_time(_text(data), NOW)
 

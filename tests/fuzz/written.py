@@ -9,15 +9,12 @@ import copy
 import json
 import re
 import subprocess
-import tempfile
 from contextlib import suppress
 from datetime import datetime
-from functools import cache
 from pathlib import PurePosixPath
 from random import Random
 from typing import Any
 
-import pygit2
 import pyjson5
 import yaml
 from demandops.base import strict_yaml
@@ -34,6 +31,7 @@ from demandops.serve import proposal
 from hypothesis import strategies as st
 
 from tests.fuzz import Target
+from tests.fuzz.parsers import bare_repo
 from tests.kit import forms
 from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo
@@ -147,15 +145,9 @@ def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
 # ---- Git and forges ----
 
 
-@cache
-def _repo() -> pygit2.Repository:
-    folder = tempfile.mkdtemp(prefix="demandops-fuzz-")
-    return pygit2.init_repository(folder, bare=True, initial_head="main")
-
-
 def author_in_git(words: tuple[str, str, datetime]) -> None:
     name, email, time = words
-    repo, who = _repo(), commit_message.signature(name, email, time)
+    repo, who = bare_repo(), commit_message.signature(name, email, time)
     oid = repo.create_commit(None, who, who, "x", repo.TreeBuilder().write(), [])
     lines = repo[oid].read_raw().split(b"\n\n")[0].split(b"\n")
     assert [line.split(b" ")[0] for line in lines] == [b"tree", b"author", b"committer"]

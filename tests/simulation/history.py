@@ -21,7 +21,7 @@ from tests.kit.goals import connection, goal
 from tests.kit.repo import GitRepo
 from tests.model.goals import DemandMaker, Words
 from tests.model.listed import Goal
-from tests.model.running import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
+from tests.model.running import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY, Running
 from tests.model.view import key_in_ledger
 from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
@@ -287,9 +287,12 @@ class History:
         edits += [self._move_channel, self._delete_claim] * 2
         self.chance.choice([*edits, self._edit_generated, *[self._edited_often] * 4])()
 
-    def _commit(self, changed: dict[str, str | None]) -> str:
+    def _commit(
+        self, changed: dict[str, str | None], meant: Callable[[Running], object] = lambda _: None
+    ) -> None:
+        """Commit; ``meant`` makes the same change in the model."""
         who = ("Petra Platform", "petra@example.org", int(self.turns.now().timestamp()))
-        return self.repo.commit(changed, "By hand\n", who)
+        self.oracle.edits[self.repo.commit(changed, "By hand\n", who)] = meant
 
     def _override(self) -> None:
         name = self.chance.choice(sorted(_OVERRIDES))
@@ -304,14 +307,14 @@ class History:
             file["expires"] = end.isoformat().replace("+00:00", "Z")
         self._commit({path: plain_yaml.dump(file)})
 
-    def _changed(self, path: str, change: Callable[[Any], object]) -> str:
+    def _change(self, path: str, change: Callable[[Any], object], *meant: Any) -> None:
         data = plain_yaml.load(self.repo.files(path)[path])
         change(data)
-        return self._commit({path: plain_yaml.dump(data)})
+        self._commit({path: plain_yaml.dump(data)}, *meant)
 
     def _inventory(self) -> None:
         car = {"type": "vehicle", "cluster": "c-its"}
-        self._changed(
+        self._change(
             NODES, lambda data: data["nodes"].append(car | {"id": f"car{len(data['nodes'])}"})
         )
 
@@ -322,26 +325,27 @@ class History:
         name = self.chance.choice(used or sorted(PLACES))
         drained = name not in books.drained
 
-        commit = self._changed(
-            NODES,
-            lambda data: [o.update(drained=drained) for o in data["nodes"] if o["id"] == name],
-        )
-        self.oracle.edits[commit] = lambda books: books.drain(name, drained)
+        def drain(data: Any) -> None:
+            (node,) = (one for one in data["nodes"] if one["id"] == name)
+            node["drained"] = drained
+
+        self._change(NODES, drain, lambda books: books.drain(name, drained))
 
     def _stop_waiting(self) -> None:
         self.oracle.check()
         if found := sorted(self.repo.files("ledger/waiting").items()):
             path, text = self.chance.choice(found)
             demand = plain_yaml.load(text)["goal"]["demand"]
-            self.oracle.edits[self._commit({path: None})] = lambda books: books.waiting.pop(demand)
+            self._commit({path: None}, lambda books: books.waiting.pop(demand))
 
     def _move_channel(self) -> None:
         self.oracle.check()
         version = self.chance.choice([DEFAULT, NEXT])
-        commit = self._changed(
-            VERSIONS, lambda data: data["applications"][TALLY]["channels"].update(testing=version)
+        self._change(
+            VERSIONS,
+            lambda data: data["applications"][TALLY]["channels"].update(testing=version),
+            lambda books: setattr(books, "testing", version),
         )
-        self.oracle.edits[commit] = lambda books: setattr(books, "testing", version)
 
     def _delete_claim(self) -> None:
         self.oracle.check()
@@ -349,7 +353,7 @@ class History:
         if found:
             path, claim = self.chance.choice(found)
             gone = self.oracle.key_of(key_in_ledger(claim.key))
-            self.oracle.edits[self._commit({path: None})] = lambda books: books.drop([gone])
+            self._commit({path: None}, lambda books: books.drop([gone]))
 
     def _edit_generated(self) -> None:
         path = self.chance.choice(sorted(self.repo.manifests()))

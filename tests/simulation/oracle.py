@@ -154,8 +154,7 @@ class Oracle:
         self.books.chosen = {
             subject: what["node"] for (subject, _), (what, _) in claims.items() if "node" in what
         }
-        if str(commit.id) in self.edits:
-            self.edits[str(commit.id)](self.books)
+        self.edits.get(str(commit.id), lambda books: None)(self.books)
         self._follow_overrides(commit)
         for operation, branch in self._operations(commit):
             assert operation not in self._place, f"{operation} is booked twice"
