@@ -8,7 +8,6 @@ makes the claims and the rendered files.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -26,7 +25,6 @@ from demandops.model.demand.goals import read_goal
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.history import commit_message
-from demandops.serve.generator import Generator
 
 from tests.kit import goals
 from tests.kit.config import configuration, state_of
@@ -126,12 +124,6 @@ def no_fsync() -> Iterator[None]:
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)
     yield
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
-
-
-def costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
-    start, worked = time.perf_counter(), time.process_time()
-    generator.submit(goal).future.result()
-    return time.perf_counter() - start, time.process_time() - worked
 
 
 def workspace() -> TemporaryDirectory[str]:

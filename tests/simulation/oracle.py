@@ -232,7 +232,8 @@ class Oracle:
     def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:
         """Follow what a generator did by itself: it ends leases, lets in and moves."""
         both = self._claims.keys() & claims.keys()
-        moved = {one for one in both if _node(self._claims[one]) != _node(claims[one])}
+        before = self._claims
+        moved = {one for one in both if before[one][0].get("node") != claims[one][0].get("node")}
         let_in = {demand for _, demand in claims.keys() - both}
         self.counts.update(let_in=len(let_in), moved=len(moved))
         for demand in let_in:
@@ -464,7 +465,3 @@ def _carried(text: str) -> dict[str, str]:
     found += [(read[named]["ros_topic"], named) for named in read.get("mqtt_topics", ())]
     assert len(dict(found)) == len(found), f"a topic is carried twice: {found}"
     return dict(found)
-
-
-def _node(claim: view.Content) -> object:
-    return claim[0].get("node")
