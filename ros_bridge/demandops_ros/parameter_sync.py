@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import click
 from demandops.base import strict_yaml
 from demandops.base.errors import DemandOpsError, InvalidInput, fault
-from demandops.base.quoting import one_line, quoted
+from demandops.base.quoting import one_line
+from demandops.base.ros_parameters import flat_parameters
 from demandops.base.runtime import REAL
 from demandops.cluster.watches import ConfigMapWatch
-from rcl_interfaces.srv import GetParameterTypes, SetParametersAtomically
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterEvent, ParameterValue
+from rcl_interfaces.srv import GetParameters, GetParameterTypes, SetParametersAtomically
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.serialization import deserialize_message, serialize_message
 
 from demandops_ros import node_parameters, ros_process
 from demandops_ros.node_parameters import read_parameters, ros_name_or_none
@@ -31,38 +35,32 @@ def parameters_of(node: str, text: str, file: str) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise InvalidInput([fault("", "must map nodes to their parameters").within(file)])
     name = node.lstrip("/")
-    parameters: dict[str, Any] = {}
-    for key in ("/**", "**", "/*", "*", f"/{name}", name):
-        if key in data:
-            section = data[key].get(_SECTION) if isinstance(data[key], dict) else None
-            if not isinstance(section, dict):
-                raise InvalidInput([fault(f"{key}.{_SECTION}", "must be a mapping").within(file)])
-            parameters.update(_flat(section))
-    if not parameters:
+    keys = [key for key in ("/**", "**", "/*", "*", f"/{name}", name) if key in data]
+    if not keys:
         problem = f"has no parameters of the node; write {name}: {{{_SECTION}: …}}"
         raise InvalidInput([fault(name, problem).within(file)])
+    parameters: dict[str, Any] = {}
+    for key in keys:
+        # a node whose parameters are all gone has nothing below the section's name
+        section = data[key].get(_SECTION, "") if isinstance(data[key], dict) else ""
+        place = f"{key}.{_SECTION}"
+        try:
+            if not isinstance(section, dict | None):
+                raise InvalidInput.at(place, "must be a mapping")
+            parameters.update(flat_parameters(section or {}, place))
+        except InvalidInput as error:
+            raise InvalidInput(strict_yaml.faults_in(error, file)) from None
     return parameters
-
-
-def _flat(section: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in section.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 # ---- the parameters of another node, set again after that node restarts ----
 #
 # A restarted node publishes its parameter events at a new endpoint, which the ROS graph shows.
 
-_LARGEST = 2**63 - 1  # the largest integer that ROS can transport
-_LISTS = {
-    Parameter.Type.BOOL_ARRAY,
-    Parameter.Type.INTEGER_ARRAY,
-    Parameter.Type.DOUBLE_ARRAY,
-    Parameter.Type.STRING_ARRAY,
-}
+_KINDS = Parameter.Type
+_INTEGERS = {_KINDS.INTEGER, _KINDS.INTEGER_ARRAY}
+_DOUBLES = {_KINDS.DOUBLE, _KINDS.DOUBLE_ARRAY}
+_LISTS = {_KINDS.BOOL_ARRAY, _KINDS.INTEGER_ARRAY, _KINDS.DOUBLE_ARRAY, _KINDS.STRING_ARRAY}
 _ANSWER_S = 2.0  # a node that does not answer for so long has ended
 # A node may refuse what it takes later, such as a lifecycle node that declares its parameters when
 # it is configured.
@@ -72,28 +70,37 @@ _REFUSED_S = 5.0
 def as_the_node_has_it(name: str, value: Any, kind: int) -> Parameter:  # noqa: ANN401
     """Return a parameter with the type that the node has for it; ``kind`` 0 is an unknown one.
 
-    A file does not tell all types: Helm writes 10.0 as 10, and an empty list has none. It stands
-    there as a list of one empty text, too, because ROS's own reader refuses an empty one.
+    A file does not tell all types: many programs write 10.0 as 10, and an empty list has none. It
+    stands there as a list of one empty text, too, because ROS's own reader refuses an empty one.
     """
-    if kind in _LISTS and (value == [] or (value == [""] and kind != Parameter.Type.STRING_ARRAY)):
-        return Parameter(name, Parameter.Type(kind), [])
-    if kind == Parameter.Type.DOUBLE and type(value) is int:
-        value = float(value)
-    kinds = {*map(type, value)} if isinstance(value, list) else set()
-    if kinds == {int, float} or (kinds == {int} and kind == Parameter.Type.DOUBLE_ARRAY):
-        value = [*map(float, value)]
+    if kind in _LISTS and (value == [] or (value == [""] and kind != _KINDS.STRING_ARRAY)):
+        return Parameter(name, _KINDS(kind), [])
+    items = value if isinstance(value, list) else [value]
+    types = {*map(type, items)}
+    number: type | None = None
+    if types and types <= {int, float}:
+        if kind in _INTEGERS and all(abs(item) < 2**63 and item % 1 == 0 for item in items):
+            number = int
+        elif kind in _DOUBLES or len(types) == 2:
+            number = float
+    if number:
+        value = [*map(number, value)] if isinstance(value, list) else number(value)
     return Parameter(name, value=value)
 
 
 class ParameterSetter:
     """Sets the parameters of the node ``target`` to those of the last call of :meth:`want`.
 
-    The node takes all of them or none. ``problem`` is why it does not have them; empty if it has.
+    The node takes all of them or none. A parameter that is wanted no more gets back what it had
+    before it was set first. ``problem`` is why the node does not have them; empty if it has.
     """
 
-    def __init__(self, node: Node, target: str, on_answer: Callable[[], None]) -> None:
+    def __init__(
+        self, node: Node, target: str, on_answer: Callable[[], None], state_file: Path
+    ) -> None:
         self._node = node
         self._types = node.create_client(GetParameterTypes, f"{target}/get_parameter_types")
+        self._get = node.create_client(GetParameters, f"{target}/get_parameters")
         self._set = node.create_client(
             SetParametersAtomically, f"{target}/set_parameters_atomically"
         )
@@ -103,6 +110,15 @@ class ParameterSetter:
         self._lock = REAL.lock()
         self._wanted: Mapping[str, Any] = {}
         self._version = 0
+        # What the node had before, as messages by name. A restarted node has it again. One that
+        # runs on while only this process is restarted has not, so a file remembers it.
+        self._before: dict[str, Any] = {}
+        self._memory: Path | None = Path(f"{state_file}{self._target.replace('/', '.')}")
+        if state_file.is_char_device():
+            self._memory = None
+        elif self._memory.exists():
+            kept = deserialize_message(self._memory.read_bytes(), ParameterEvent)
+            self._before = {each.name: each for each in kept.changed_parameters}
         # the target's endpoints when it last answered, and the version of these parameters
         self._answered: tuple[Any, int] | None = None
         self._call: tuple[Any, Any] | None = None  # the client, and the future of its answer
@@ -111,18 +127,7 @@ class ParameterSetter:
         node.create_timer(0.2, self._set_if_needed)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
-        # any thread may call this; TypeError or ValueError names a value that ROS cannot carry
-        for name, value in parameters.items():
-            for number in value if isinstance(value, list) else [value]:
-                if isinstance(number, int) and not -_LARGEST - 1 <= number <= _LARGEST:
-                    raise ValueError(
-                        f"parameter {name}: {quoted(str(number))} is out of ROS's range; write a "
-                        f"number between {-_LARGEST - 1} and {_LARGEST}"
-                    )
-            try:
-                as_the_node_has_it(name, value, 0).to_parameter_msg()
-            except (TypeError, ValueError) as error:
-                raise type(error)(f"parameter {name}: {error}") from None
+        # any thread may call this
         with self._lock:
             self._wanted, self._version = parameters, self._version + 1
         self._changed.trigger()
@@ -147,28 +152,45 @@ class ParameterSetter:
         is_answered = self._answered == (endpoints, version)
         if is_answered and not (self.problem and now - self._answered_at >= _REFUSED_S):
             return
-        is_ready = self._types.service_is_ready() and self._set.service_is_ready()
-        if version == 0 or not endpoints or not is_ready:
+        clients = (self._types, self._get, self._set)
+        if version == 0 or not endpoints or not all(c.service_is_ready() for c in clients):
             return
+        before = self._before
 
         def take_types(response: Any) -> None:  # noqa: ANN401
             # none at all if the node lacks one of the parameters, which it then refuses by name
-            kinds = [*response.types, *[0] * len(wanted)]
-            parameters = [
-                as_the_node_has_it(name, value, kind).to_parameter_msg()
-                for (name, value), kind in zip(wanted.items(), kinds, strict=False)
-            ]
-            request = SetParametersAtomically.Request(parameters=parameters)
-            self._ask(self._set, request, take_result)
+            kinds = dict(zip(wanted, [*response.types, *[0] * len(wanted)], strict=False))
+            new = [name for name in wanted if name not in before] if response.types else []
+            # only those with a value, because a node gives none at all if one has none
+            asked = [name for name in new if kinds[name]]
+
+            def take_values(response: Any) -> None:  # noqa: ANN401
+                if len(response.values) == len(asked):
+                    had = dict.fromkeys(new, ParameterValue())
+                    had |= dict(zip(asked, response.values, strict=True))
+                    noted = (ParameterMessage(name=name, value=had[name]) for name in had)
+                    self._remember(before | {each.name: each for each in noted})
+                parameters = [
+                    as_the_node_has_it(name, value, kinds[name]).to_parameter_msg()
+                    for name, value in wanted.items()
+                ]
+                parameters += [each for name, each in before.items() if name not in wanted]
+                request = SetParametersAtomically.Request(parameters=parameters)
+                self._ask(self._set, request, take_result)
+
+            self._ask(self._get, GetParameters.Request(names=asked), take_values)
 
         def take_result(response: Any) -> None:  # noqa: ANN401
-            result, before = response.result, self.problem
+            result, problem = response.result, self.problem
             self._answered, self._answered_at = (endpoints, version), REAL.monotonic()
             self.problem = ""
-            if not result.successful:
+            if result.successful:
+                self._remember({k: each for k, each in self._before.items() if k in wanted})
+            else:
+                self._remember(before)
                 reason = result.reason or "no reason given"
                 self.problem = one_line(f"{self._target} refused its parameters: {reason}")
-            if self.problem and (self.problem != before or not is_answered):
+            if self.problem and (self.problem != problem or not is_answered):
                 self._node.get_logger().error(self.problem)
             elif not self.problem:
                 self._node.get_logger().info(f"set {len(wanted)} parameters of {self._target}")
@@ -176,6 +198,14 @@ class ParameterSetter:
             self._changed.trigger()  # other parameters may be wanted by now
 
         self._ask(self._types, GetParameterTypes.Request(names=[*wanted]), take_types)
+
+    def _remember(self, before: dict[str, Any]) -> None:
+        if before != self._before and self._memory:
+            kept = ParameterEvent(changed_parameters=[*before.values()])
+            unfinished = Path(f"{self._memory}.new")
+            unfinished.write_bytes(serialize_message(kept))
+            unfinished.replace(self._memory)
+        self._before = before
 
     def _ask(self, client: Any, request: Any, then: Callable[[Any], None]) -> None:  # noqa: ANN401
         future = client.call_async(request)
@@ -257,7 +287,8 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
                 state_file.write_text("; ".join(filter(None, problems)) or "set\n", "utf-8")
 
         setters = {
-            name: ParameterSetter(node, name, tell) for name in given["target_ros_node"].split(",")
+            name: ParameterSetter(node, name, tell, state_file)
+            for name in given["target_ros_node"].split(",")
         }
 
         def take(data: Mapping[str, str]) -> None:
@@ -267,7 +298,7 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
                         raise InvalidInput.at("", "is missing; add it to the ConfigMap", file=file)
                     setter.want(parameters_of(target, data[key], file))
                     unread.pop(target, None)
-                except (DemandOpsError, TypeError, ValueError) as error:
+                except DemandOpsError as error:
                     unread[target] = one_line(f"{error}; {target} keeps its parameters")
                     node.get_logger().error(unread[target])
             tell()

@@ -4,7 +4,7 @@
 
 These are our own packages, and the messages of each package in a FOLDER, so that the event detector
 can read them: msg/*.msg, with or without the rest of a package. The environment keeps a copy of
-FOLDER's definitions, and later builds take that.
+FOLDER's definitions, and later builds take that, but leave it out while what it needs is gone.
 
 The script needs only the standard library, and nothing imports it. The environment must have the
 ROS 2 wheels of PyPI; afterwards `import demandops_interfaces` works without any environment
@@ -190,7 +190,7 @@ def find_packages(given: Iterable[str]) -> dict[str, Package]:
             if chosen.setdefault(name, folder) != folder:
                 raise Refused(f"{folder}: is named {name}, like {chosen[name]}; give one of them")
     folders |= chosen
-    found = {name: _read_package(name, folder, folders) for name, folder in folders.items()}
+    found = _read_packages(folders)
     needs = {name: package.needs for name, package in found.items()}
     try:
         order = [name for name in TopologicalSorter(needs).static_order() if name in found]
@@ -215,6 +215,22 @@ def find_packages(given: Iterable[str]) -> dict[str, Package]:
     return packages
 
 
+def _read_packages(folders: dict[str, Path]) -> dict[str, Package]:
+    found = dict[str, Package]()
+    while unread := folders.keys() - found.keys():
+        name = min(unread)
+        try:
+            found[name] = _read_package(name, folders[name], folders)
+        except Refused as refusal:
+            if folders[name].parent != KEPT:
+                raise
+            # else each later build would fail, whatever is given; and others may need this one
+            print(f"left out: {refusal}", file=sys.stderr)
+            del folders[name]
+            found.clear()
+    return found
+
+
 def _name_of(folder: Path) -> str:
     manifest = folder / "package.xml"
     text = manifest.read_text(encoding="utf-8", errors="replace") if manifest.is_file() else ""
@@ -234,17 +250,24 @@ def _read_package(name: str, folder: Path, known: Mapping[str, Path]) -> Package
     package = Package(name, folder)
     if package.is_ours:
         return package
-    used = set[str]()
-    for path in package.files:
+    used = set[tuple[str, str]]()
+    for path in folder.glob("msg/**/*.msg"):
         place = path.relative_to(folder)
         if not re.fullmatch(r"msg(/[A-Za-z0-9_]+)*/[A-Z][A-Za-z0-9]*\.msg", str(place)):
             raise Refused(f"{path}: is no name of a message; write it like msg/EgoData.msg")
+        if not path.is_file():
+            raise Refused(f"{path}: leads to no file; remove the link, or mend it")
         text = path.read_text(encoding="utf-8", errors="replace")
-        used |= {*re.findall(r"^\s*([a-z][a-z0-9_]*)/", text, re.MULTILINE)}
-    for need in sorted(used - {name}):
-        if need not in known and not (PREFIX / "share" / need / "msg").is_dir():
-            raise Refused(f"{folder}: needs {need}, which is not installed; give its folder too")
-    return Package(name, folder, tuple(sorted(used - {name})))
+        used |= {*re.findall(r"^\s*([a-z][a-z0-9_]*)/(?:msg/)?(\w*)", text, re.MULTILINE)}
+    for need, kind in sorted(used):
+        if need in known:
+            lacks = not any(known[need].glob(f"msg/**/{kind}.msg"))
+        else:  # one that is left out may still be installed, as it was
+            lacks = (KEPT / need).is_dir() or not (PREFIX / "share" / need / "msg").is_dir()
+        if lacks:
+            named = f"{need}/{kind}" if need in known else need
+            raise Refused(f"{folder}: needs {named}, which is not installed; give its folder too")
+    return Package(name, folder, tuple(sorted({need for need, _ in used} - {name})))
 
 
 def read_record() -> dict[str, Any]:

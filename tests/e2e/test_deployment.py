@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import json
 import os
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from tests.e2e.rig import githttp
 from tests.e2e.rig.cluster import Rig, git_server
 from tests.e2e.rig.kube import build_manifest
 from tests.e2e.rig.net import free_port, url
-from tests.kit.repo import git
+from tests.kit.repo import git, hook, keygen
 from tests.kit.ros import Client
 
 pytestmark = pytest.mark.only("flux", "the generator's chart does not depend on the controller")
@@ -81,9 +80,7 @@ class Deployed:
         git(self.repository, "config", "http.receivepack", "true")
         secrets = {githttp.USER_VARIABLE: USER, githttp.PASSWORD_VARIABLE: PASSWORD}
         rig.parts.start_together([git_server(GIT, self.repository.parent, port, secrets)])
-        key = folder / "key"
-        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
-        self.private_key = key.read_text()
+        self.private_key = keygen(folder / "key").read_text()
         self._secret("git", username=USER, password=PASSWORD)
         self._secret("signing", **{"ssh-privatekey": self.private_key})
         self.values: dict[str, Any] = {
@@ -215,10 +212,8 @@ def test_a_pod_that_returns_hands_in_its_journal_before_it_stands_by(
     standby.wait_text("taking demands on")
     deployed.rig.parts.start(GIT)
     assert deployed.subjects() == before, "the other pod must not have booked the demand"
-    slow = deployed.repository / "hooks" / "pre-receive"
-    slow.parent.mkdir(exist_ok=True)
-    slow.write_text("#!/bin/sh\nsleep 5\n")  # else the push would win against a wrong order, too
-    slow.chmod(0o755)
+    # else the push would win against a wrong order, too
+    slow = hook(deployed.repository, "pre-receive", "sleep 5")
     deployed.start(active)
     slow.unlink()
     assert deployed.subjects() != before

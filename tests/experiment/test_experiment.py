@@ -22,6 +22,7 @@ from examples.experiment.full.participants import EGO_DATA
 from examples.experiment.full.process_runner import Container, RunningPod, path_in_pod
 from examples.experiment.full.rules import Event, Near, bag_tracks, causes, events_of, predicted
 from tests.e2e.common.expected import DETECTION, FUSION, source_end, target_end
+from tests.kit import plain_yaml
 from tests.kit.detection import write_bag
 
 NEAR, GAP_S, OVER = Near.read(), 10.0, 60.0
@@ -278,19 +279,7 @@ def test_the_larger_experiment_s_rules_events_and_checks() -> None:
     assert all(f">{station}<" in page for station in large.STATIONS)
 
 
-@pytest.mark.parametrize(
-    ("text", "found"),
-    [
-        ("params_file:=/config/params.yaml", "params_file:=/pod/c/params.yaml"),
-        ("/config", "/pod/c"),
-        ("/configuration/x", "/configuration/x"),
-        ("/other/config/x", "/other/config/x"),
-        ("/config/deep/x", "/pod/d/x"),
-        ("/tmp", "/tmp/pod/t"),
-        ("/config/x:/tmp/y", "/pod/c/x:/tmp/pod/t/y"),
-        ("/params/x", "/tmp/pod/i/x"),
-    ],
-)
+@pytest.mark.parametrize(("text", "found"), plain_yaml.beside(__file__))
 def test_a_path_below_a_mount_becomes_one_of_this_machine(text: str, found: str) -> None:
     mounts = {"/config": "/pod/c", "/config/deep": "/pod/d", "/tmp": "/tmp/pod/t"}
     assert path_in_pod(text, mounts | {"/params": "/tmp/pod/i"}) == found

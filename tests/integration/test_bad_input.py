@@ -5,7 +5,6 @@ A refused input leaves no commit and nothing in the journal, and the next demand
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ import yaml
 
 from tests.integration.conftest import On
 from tests.kit import plain_yaml
-from tests.kit.limits import PATIENCE_S
+from tests.kit.cli import process
 from tests.kit.repo import GitRepo
 
 APPDEF = "appdefs/object-detection-fusion"
@@ -86,12 +85,9 @@ class TestYamlAttacks:
         files = [tmp_path / "lists.yaml", tmp_path / "mappings.yaml"]
         for file, opening, closing in zip(files, ("[", "{a: "), "]}", strict=True):
             file.write_text("apps: " + opening * 40_000 + closing * 40_000)
-        ran = subprocess.run(
-            [sys.executable, "-c", EACH, str(state.path), *map(str, files)],
-            capture_output=True, text=True, timeout=PATIENCE_S, check=True,
-        )  # fmt: skip
-        assert ran.stdout == "1\n1\n"
-        for file, said in zip(files, ran.stderr.splitlines(), strict=True):
+        ran = process(sys.executable, "-c", EACH, state.path, *files)
+        assert (ran.code, ran.out) == (0, "1\n1\n")
+        for file, said in zip(files, ran.err.splitlines(), strict=True):
             assert said.startswith(f"error: {file}: ")
             assert "nested" in said
 

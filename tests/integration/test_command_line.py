@@ -7,8 +7,6 @@ More is in ``stories``; what commands print on a terminal is in ``tests/terminal
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +14,7 @@ from demandops.base.errors import Unsound
 from demandops.cli.queries import commits
 
 from tests.integration.conftest import On
-from tests.kit.cli import Ran
+from tests.kit.cli import PROGRAM, Ran, process
 from tests.kit.repo import git
 
 
@@ -43,9 +41,7 @@ class TestProcess:
     """The command as a process of its own."""
 
     def run(self, *args: str, **environment: str) -> Ran:
-        command, env = [sys.executable, "-m", "demandops.cli.main", *args], os.environ | environment
-        done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
-        return Ran(done.returncode, done.stdout, done.stderr)
+        return process(*PROGRAM, *args, env=os.environ | environment)
 
     def test_in_a_hook_it_works_on_the_state_repo_and_not_on_the_hooks_repo(
         self, bare: Path, tmp_path: Path

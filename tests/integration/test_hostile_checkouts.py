@@ -32,7 +32,7 @@ from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.cli import Ran
 from tests.kit.http import Server, serving
-from tests.kit.repo import git
+from tests.kit.repo import git, program
 
 CHARTS = "appdefs/object-detection-fusion/charts"
 CHART = f"{CHARTS}/object-fusion"
@@ -95,16 +95,15 @@ def lab(
     capsys: pytest.CaptureFixture[str],
 ) -> Callable[[], Lab]:
     """Return a function that sets a lab up anew."""
-    program = tmp_path / "helm"
+    helm = tmp_path / "helm"
     if getattr(request, "param", "greedy") == "real":
         built = [*tools.cache_root().glob("helm-*/helm")]
         if not built:
             pytest.skip("the rig of the end-to-end tests has not built helm")
-        program = built[0]
+        helm = built[0]
     else:
-        program.write_text(f"#!{sys.executable} -IS\n" + Path(greedy_helm.__file__).read_text())
-        program.chmod(0o755)
-    monkeypatch.setenv(HELM_BIN, str(program))
+        program(helm, Path(greedy_helm.__file__).read_text(), f"{sys.executable} -IS")
+    monkeypatch.setenv(HELM_BIN, str(helm))
     monkeypatch.setenv("A_SECRET", "hunter2")
 
     def made() -> Lab:

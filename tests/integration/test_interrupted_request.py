@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -14,7 +13,9 @@ import yaml
 from demandops.cli.main import run
 
 from tests.kit import rig
+from tests.kit.cli import PROGRAM
 from tests.kit.limits import PATIENCE_S
+from tests.kit.repo import program
 from tests.kit.rig import Person
 
 
@@ -57,14 +58,13 @@ def test_an_interrupted_request_says_which_demands_are_answered(
 
 
 def test_an_interrupted_check_leaves_no_folder(person: Person, tmp_path: Path) -> None:
-    helm, scratch, started = tmp_path / "helm", tmp_path / "scratch", tmp_path / "started"
-    helm.write_text(f"#!/bin/sh\ntouch {started}\nexec sleep 600\n")
-    helm.chmod(0o755)
+    scratch, started = tmp_path / "scratch", tmp_path / "started"
+    helm = program(tmp_path / "helm", f"touch {started}\nexec sleep 600")
     scratch.mkdir()
     person.fetch()
     chart = person.folder / "appdefs/object-detection-fusion/charts/object-fusion/values.yaml"
     chart.write_text(chart.read_text() + "# a new chart is rendered\n")
-    command = [sys.executable, "-m", "demandops.cli.main", "check", str(person.folder)]
+    command = [*PROGRAM, "check", str(person.folder)]
     environment = {**os.environ, "HELM_BIN": str(helm), "TMPDIR": str(scratch)}
     process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
     rig.wait_until(started.exists, "helm runs")

@@ -20,9 +20,9 @@ import yaml
 from click.testing import CliRunner
 from demandops.cli.authoring.check import MARK
 
-from tests.kit.cli import Run
+from tests.kit.cli import Ran, Run, process
 from tests.kit.config import skeleton
-from tests.kit.repo import git
+from tests.kit.repo import git, program
 
 FILES = {
     "github": ".github/workflows/demandops.yml",
@@ -36,21 +36,12 @@ IMAGES = Path(__file__).parents[2] / "templates" / "scaffold" / "image"
 BASH = shutil.which("bash") or "bash"
 
 
-def bash(script: str, folder: Path, **options: Any) -> subprocess.CompletedProcess[str]:
+def bash(script: str, folder: Path, **options: Any) -> Ran:
     """Run a script with the variables of `options`; each `/tmp/` in it is the test's folder."""
     cwd, environ = options.pop("cwd", folder), {"DEMANDOPS_DATA_HOME": str(folder / "data")}
-    return subprocess.run(
-        [BASH, "-e", "-c", script.replace("/tmp/", f"{folder}/")],
-        cwd=cwd, env=os.environ | environ | {"RUNNER_TEMP": str(folder)} | options,
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-
-
-def program(path: Path, text: str) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(f"#!{BASH}\n{text}\n")
-    path.chmod(0o755)
-    return path
+    environ |= {"RUNNER_TEMP": str(folder)} | options
+    command = (BASH, "-e", "-c", script.replace("/tmp/", f"{folder}/"))
+    return process(*command, cwd=cwd, env=os.environ | environ)
 
 
 @pytest.fixture
@@ -141,14 +132,14 @@ def test_a_pipeline_installs_what_the_variable_names(scripts: list[str], tmp_pat
     package = "git+https://git.example.org/demandops.git@v1.0.0"
     done = bash(script, tmp_path, PATH=path, DEMANDOPS_PACKAGE=package)
     constraints = tmp_path / "demandops/share/demandops/constraints.txt"
-    assert done.stdout.splitlines() == [
+    assert done.out.splitlines() == [
         "python -I -m venv",
         f"pip install --quiet --no-deps {package}",
         f"pip install --quiet --constraint {constraints} demandops",
     ]
     done = bash(script, tmp_path, PATH=path, DEMANDOPS_PACKAGE="")
-    assert (done.returncode != 0, done.stdout) == (True, "")
-    assert "DEMANDOPS_PACKAGE: is not set; set this variable of the " in done.stderr
+    assert (done.code != 0, done.out) == (True, "")
+    assert "DEMANDOPS_PACKAGE: is not set; set this variable of the " in done.err
 
 
 @both
@@ -164,13 +155,13 @@ def test_a_pipeline_checks_and_reports(scripts: list[str], checkout: Path, tmp_p
     summary = tmp_path / "summary.md"
     names |= {"GITHUB_STEP_SUMMARY": str(summary), "HELM_BIN": str(program(tmp_path / "helm", ""))}
     done = bash("\n".join(wanted), tmp_path, cwd=checkout, **names)
-    assert done.returncode == 1, done.stderr
+    assert done.code == 1, done.err
     report = next(path for path in (tmp_path, checkout) if (path / "report.md").exists())
     told = (report / "report.md").read_text()
     assert told.startswith(f"{MARK}\n## DemandOps: 1 error")
-    assert told == (summary.read_text() if summary.exists() else done.stdout)
+    assert told == (summary.read_text() if summary.exists() else done.out)
     git(checkout, "checkout", "--quiet", ".")
-    assert bash("\n".join(wanted), tmp_path, cwd=checkout, **names).returncode == 0
+    assert bash("\n".join(wanted), tmp_path, cwd=checkout, **names).code == 0
 
 
 @both
@@ -185,7 +176,7 @@ def test_helm_is_brought_as_its_digest_says(scripts: list[str], tmp_path: Path) 
         given = re.sub("digest=[0-9a-f]+", f"digest={digest}", script)
         more = {"CI_PROJECT_DIR": str(tmp_path), "HELM_SOURCE": tmp_path.as_uri()}
         done = bash(given, tmp_path, **more)
-        assert (done.returncode == 0) == brought, done.stderr
+        assert (done.code == 0) == brought, done.err
         assert (tmp_path / "helm" / "helm").exists() == brought
 
 
@@ -224,8 +215,7 @@ def commented(
     comments.
     """
     shutil.rmtree(folder / "its", ignore_errors=True)
-    gh = program(folder / "its" / "gh", "")
-    gh.write_text(f"#!{sys.executable}\n{GH}")
+    gh = program(folder / "its" / "gh", GH, sys.executable)
     with zipfile.ZipFile(gh.with_name("artifact.zip"), "w") as packed:
         for name, text in entries.items():
             packed.writestr(name, text)
@@ -242,7 +232,7 @@ def commented(
     done = bash(script, folder, cwd=work, PATH=f"{gh.parent}:{os.environ['PATH']}", **names)
     written = gh.with_name("written")
     assert {path.name for path in work.iterdir()} <= {"report.md", "report.zip"}
-    return done.returncode, written.read_text() if written.exists() else ""
+    return done.code, written.read_text() if written.exists() else ""
 
 
 def test_the_report_becomes_a_comment_and_a_newer_one_changes_it(tmp_path: Path) -> None:
@@ -288,7 +278,7 @@ def test_the_proposed_image_passes_check(
     def propose(tag: str, digest: str) -> tuple[int, str, str]:
         script = f'{BASH} "{package}/ci/propose-image" "$TAG" "$DIGEST"'
         done = bash(script, tmp_path, STATE_REPO=remote.as_uri(), TAG=tag, DIGEST=digest)
-        return done.returncode, done.stdout, done.stderr
+        return done.code, done.out, done.err
 
     for tag, given, wrong in (("1; reboot", digest, 0), ("$(x)", digest, 0), ("1.0", "latest", 1)):
         code, _, told = propose(tag, given)

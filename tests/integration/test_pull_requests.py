@@ -21,13 +21,12 @@ from tests.integration.conftest import On
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.goals import EXPERIMENT, perception
-from tests.kit.repo import git
+from tests.kit.repo import git, hook
 
 HERE = Path(__file__).parent
 EDITS = plain_yaml.load((HERE / "edits.yaml").read_text())
 EDGE = "clusters/c-its/perception/edge"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"
-CLIENT = "clusters/c-its/perception/vehicle00/mqtt-vehicle00-edge-source-d3ca91c2df6c.yaml"
 FUSION = f"{EDGE}/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
 LOST = "is generated, so a manual edit is lost; revert it"
 
@@ -115,12 +114,9 @@ def test_the_override_suggested_gives_the_file_that_was_edited_by_hand(
 def test_git_runs_no_program_of_the_checkout_and_writes_nothing_into_it(
     branch: Path, check: Run
 ) -> None:
-    hook = branch / "hooks" / "post-index-change"
-    hook.parent.mkdir()
-    hook.write_text("#!/bin/sh\ntouch ran\n")
-    hook.chmod(0o755)
+    file = hook(branch, "post-index-change", "touch ran")
     git(branch, "update-index", "--split-index")
-    options = {"splitIndex": "true", "fsmonitor": str(hook), "hooksPath": "hooks"}
+    options = {"splitIndex": "true", "fsmonitor": str(file), "hooksPath": "hooks"}
     for name, value in options.items():
         git(branch, "config", f"core.{name}", value)
     newer_images(branch)

@@ -20,19 +20,13 @@ from demandops.repo.git.signing import Signer, SigningFailed
 
 from tests.integration.conftest import On
 from tests.kit import rig
-from tests.kit.cli import Ran
+from tests.kit.cli import Ran, process
 from tests.kit.goals import Goal, connection, goal
-from tests.kit.repo import FORGER, GitRepo, branches, git
+from tests.kit.repo import FORGER, GitRepo, branches, git, keygen, program
 
 SIGNERS = "policy/allowed-signers"
 Book = Callable[..., Ran]
 Accepts = Callable[..., bool]
-
-
-def keygen(path: Path, passphrase: str = "", kind: str = "ed25519") -> Path:
-    command = ["ssh-keygen", "-q", "-t", kind, "-N", passphrase, "-C", "", "-f", str(path)]
-    subprocess.run(command, check=True)
-    return path
 
 
 def listed(key: Path) -> str:
@@ -57,8 +51,7 @@ def book(on: On) -> Book:
 @pytest.fixture
 def agent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An ssh-agent without keys, for one test."""
-    command = ["ssh-agent", "-a", str(tmp_path / "agent")]
-    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    said = process("ssh-agent", "-a", tmp_path / "agent").out
     pid = re.search(r"SSH_AGENT_PID=(\d+)", said)
     assert pid
     monkeypatch.setenv("SSH_AUTH_SOCK", str(tmp_path / "agent"))
@@ -74,8 +67,7 @@ def git_accepts(state: GitRepo, tmp_path: Path) -> Accepts:
         (tmp_path / "allowed").write_text(listed(key))
         config = ["gpg.format=ssh", f"gpg.ssh.allowedSignersFile={tmp_path / 'allowed'}"]
         options = [word for each in config for word in ("-c", each)]
-        command = ["git", "-C", str(state.path), *options, "verify-commit", commit]
-        return subprocess.run(command, capture_output=True, check=False).returncode == 0
+        return process("git", "-C", state.path, *options, "verify-commit", commit).code == 0
 
     return accepts
 
@@ -191,9 +183,8 @@ class TestVerify:
         self, newest: Callable[[], str], signed: pygit2.Commit, state: GitRepo,
         tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     ) -> None:  # fmt: skip
-        gpg = tmp_path / "gpg"
-        gpg.write_text("#!/bin/sh\nprintf '\\n[GNUPG:] %s\\n' 'GOODSIG 1 x' TRUST_ULTIMATE\n")
-        gpg.chmod(0o755)
+        says = "printf '\\n[GNUPG:] %s\\n' 'GOODSIG 1 x' TRUST_ULTIMATE"
+        gpg = program(tmp_path / "gpg", says)
         for name, value in {"COUNT": "1", "KEY_0": "gpg.program", "VALUE_0": str(gpg)}.items():
             monkeypatch.setenv(f"GIT_CONFIG_{name}", value)
         armor = "-----{} PGP SIGNATURE-----"

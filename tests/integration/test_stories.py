@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import shlex
 import shutil
-import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from string import Template
@@ -24,7 +23,7 @@ from pydantic import Field
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.goals import EXPERIMENT
-from tests.kit.repo import GIT_ENVIRONMENT, GitRepo, branches, git, root
+from tests.kit.repo import GIT_ENVIRONMENT, GitRepo, branches, git, keygen, root
 
 Edits = Mapping[str, str | dict[str, str] | None]
 """Paths and their new texts: a whole text, old and new parts of it, or None to remove the file."""
@@ -160,8 +159,7 @@ class Teller:
         for name in ("key", "other"):
             file = self._folder / name
             if f"${name}" in told and not file.exists():
-                make = ("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", str(file))
-                subprocess.run(make, check=True)
+                keygen(file)
             if file.exists():
                 public = file.with_suffix(".pub").read_text()
                 words |= {name: str(file), f"{name}_public": public}

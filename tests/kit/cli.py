@@ -8,6 +8,7 @@ import os
 import pty
 import select
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -47,6 +48,16 @@ def runner(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) 
         return Ran(code, out, err)
 
     return call
+
+
+PROGRAM = (sys.executable, "-m", "demandops.cli.main")
+
+
+def process(*command: object, **options: Any) -> Ran:
+    """Run a program to its end, which must come in time."""
+    given = {"capture_output": True, "text": True, "timeout": PATIENCE_S} | options
+    done = subprocess.run([*map(str, command)], check=False, **given)
+    return Ran(done.returncode, done.stdout, done.stderr)
 
 
 # ---- on a terminal of a given size ----
@@ -102,8 +113,7 @@ class Dialogue:
         if self._pid == 0:
             os.chdir(folder or Path.cwd())
             os.environ.update(environment, TERM="xterm", COLUMNS="80", LINES="40", PAGER="cat")
-            command = [sys.executable, "-m", "demandops.cli.main", *map(str, args)]
-            os.execv(sys.executable, command)  # noqa: S606 - no shell is needed
+            os.execv(sys.executable, [*PROGRAM, *map(str, args)])  # noqa: S606 - no shell is needed
 
     def __enter__(self) -> Dialogue:
         return self

@@ -261,11 +261,21 @@ def _commits(repo: Path, revisions: str) -> tuple[Commit, ...]:
     return tuple(commit for commit in found if commit.parents)
 
 
-def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
-    path = Path(os.fspath(repo), "hooks", name)
-    path.parent.mkdir(exist_ok=True)
-    path.write_text(f"#!/bin/sh\n{script}\n")
+def program(path: Path, script: str, shell: str = "/bin/sh") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!{shell}\n{script}\n")
     path.chmod(0o755)
+    return path
+
+
+def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
+    return program(Path(os.fspath(repo), "hooks", name), script)
+
+
+def keygen(path: Path, passphrase: str = "", kind: str = "ed25519") -> Path:
+    """Make an SSH key; its public part is in a file beside it."""
+    command = ["ssh-keygen", "-q", "-t", kind, "-N", passphrase, "-C", "", "-f", str(path)]
+    subprocess.run(command, check=True)
     return path
 
 

@@ -10,7 +10,6 @@ import random
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 import uuid
@@ -31,6 +30,7 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from unique_identifier_msgs.msg import UUID
 
+from tests.kit.cli import PROGRAM
 from tests.kit.limits import PATIENCE_S
 
 STATUS = {
@@ -135,10 +135,9 @@ class Servers:
             "PYTHONFAULTHANDLER": "1",
             **self._environment,
         }
-        command = [sys.executable, "-m", "demandops.cli.main", *words]
         with log.open("w") as sink:
             process = subprocess.Popen(
-                command, env=environment, stdout=sink, stderr=subprocess.STDOUT, text=True
+                [*PROGRAM, *words], env=environment, stdout=sink, stderr=sink, text=True
             )
         self._started.append(Served(process, state_repo, log, environment, self._domain))
         return self._started[-1]

@@ -1,4 +1,3 @@
-#!/bin/sh
 # records its calls below the folder PREFIX, and builds nothing
 PATH=/usr/bin:/bin
 set -e

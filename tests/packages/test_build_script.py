@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import shutil
-import subprocess
 import sys
 import sysconfig
 from collections.abc import Callable
@@ -15,6 +14,8 @@ from types import ModuleType
 import pytest
 
 from tests.kit import plain_yaml
+from tests.kit.cli import process
+from tests.kit.repo import program
 
 INTERFACES = Path(__file__).resolve().parents[2] / "ros_bridge" / "interfaces"
 BUILD = INTERFACES / "build.py"
@@ -25,9 +26,8 @@ FOLDERS = Path(__file__).resolve().parents[1] / "fixtures" / "messages"
 
 def test_nothing_changed_is_seen_without_a_compiler() -> None:
     for environment in (os.environ, {"PATH": ""}):
-        command = [sys.executable, str(BUILD)]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    assert (done.stdout, done.stderr) == (f"interfaces: up to date in {sys.prefix}\n", "")
+        ran = process(sys.executable, BUILD, env=environment)
+        assert ran == (0, f"interfaces: up to date in {sys.prefix}\n", "")
 
 
 FAKE_CMAKE = Path(__file__).with_name("fake-cmake.sh").read_text()
@@ -58,10 +58,8 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     for wheel in module.WHEELS:
         (prefix / "site" / f"{wheel}-1.0.dist-info").mkdir(parents=True)
 
-    tools.mkdir()
     for tool in ("cmake", "ninja", "cc", "c++"):
-        (tools / tool).write_text(FAKE_CMAKE.replace("PREFIX", str(prefix)))
-        (tools / tool).chmod(0o755)
+        program(tools / tool, FAKE_CMAKE.replace("PREFIX", str(prefix)))
     monkeypatch.setenv("PATH", str(tools))
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.delenv("CXX", raising=False)
@@ -127,9 +125,18 @@ def test_folders_of_messages_are_built_after_what_they_need_and_kept(
     built = [line.split()[1] for line in capsys.readouterr().out.splitlines()[-8:]]
     assert built == ["fleet_msgs:"] * 4 + ["hazard_msgs:"] * 4
     (given / "fleet_msgs" / "msg" / "Motion.msg").write_text("float64[] state\n")
-    for folders, made in (((), 0), ((str(given / "fleet_msgs"),), 2), ((), 0)):
-        assert script.main(*folders) == 0
+    (given / "again").symlink_to("fleet_msgs")
+    for folders, made in (((), 0), (("fleet_msgs", "fleet_msgs", "again"), 2), ((), 0)):
+        assert script.main(*(str(given / name) for name in folders)) == 0
         assert calls(script) == ["configure", *MADE] * made
+    (given / "fleet_msgs" / "msg" / "Lost.msg").symlink_to("nowhere")
+    assert script.main(str(given)) == 1
+    # without what it needs, a kept package fails no build
+    (script.KEPT / "fleet_msgs" / "msg" / "Report.msg").unlink()
+    (script.SITE / "ros_rclpy-1.0.dist-info").rename(script.SITE / "ros_rclpy-2.dist-info")
+    assert script.main() == 0
+    assert "hazard_msgs: needs fleet_msgs/Report, which" in capsys.readouterr().err
+    assert calls(script) == [*ALL, "configure", *MADE]
 
 
 @pytest.mark.parametrize(("files", "told"), TOOLS["refused"].values(), ids=TOOLS["refused"])

@@ -9,11 +9,12 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.kit.cli import process
 
 BRIDGE = Path(__file__).resolve().parents[2] / "ros_bridge"
 COLCON = shutil.which("colcon", path=str(Path(sys.executable).parent))
@@ -52,11 +53,9 @@ def run(command: list[str], folder: Path) -> str:
         "HOME": str(folder),
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
     }
-    result = subprocess.run(
-        command, cwd=folder, env=environ, capture_output=True, text=True, check=False, timeout=900
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    return result.stdout
+    ran = process(*command, cwd=folder, env=environ, timeout=900)
+    assert ran.code == 0, ran
+    return ran.out
 
 
 def test_the_packages_build_with_colcon_and_bring_code_data_and_launch_files(

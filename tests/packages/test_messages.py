@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.kit import plain_yaml
-from tests.kit.cli import Run
+from tests.kit.cli import Run, process
 from tests.kit.detection import rule, text_of
 from tests.kit.limits import LONGEST_TEST_S
 from tests.kit.live import DEFINITIONS, Step, heard_live, told
@@ -35,14 +35,8 @@ def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
         path.unlink()
         path.write_text(text)
     made = copy / "bin" / "python"
-    ran = subprocess.run(
-        [made, BUILD, DEFINITIONS],
-        capture_output=True,
-        text=True,
-        timeout=LONGEST_TEST_S,
-        check=True,
-    )
-    assert "verify hazard_msgs" in ran.stdout
+    ran = process(made, BUILD, DEFINITIONS, timeout=LONGEST_TEST_S)
+    assert ran.code == 0 and "verify hazard_msgs" in ran.out, ran
     return made
 
 

@@ -16,13 +16,15 @@ import demandops
 import pytest
 import yaml
 
+from tests.kit.cli import Ran, process
+from tests.kit.repo import program
+
 ROOT = Path(__file__).parents[2]
 NAME = f"demandops-{demandops.__version__}"
 
 
-def release(script: Path, *args: str) -> subprocess.CompletedProcess[str]:
-    env = os.environ | {"PYTHON": sys.executable}
-    return subprocess.run([script, *args], env=env, capture_output=True, text=True, check=False)
+def release(script: Path, *args: str) -> Ran:
+    return process(script, *args, env=os.environ | {"PYTHON": sys.executable}, timeout=600)
 
 
 def test_everything_has_the_same_version() -> None:
@@ -55,16 +57,16 @@ def test_no_release_leaves_a_change_untold(tmp_path: Path) -> None:
     for section, told in (("0.0.1", f"no section '## {version}'"), (version, "odd-names.audit.md")):
         (tmp_path / "CHANGELOG.md").write_text(f"# Changelog\n\n## {section} (2026-11-21)\n")
         done = release(script)
-        assert (done.returncode, done.stdout) == (1, ""), done
-        assert told in done.stderr
+        assert (done.code, done.out) == (1, ""), done
+        assert told in done.err
 
 
 @pytest.mark.slow
 @pytest.mark.limit(600)
 def test_a_release_is_built_and_tried_in_an_empty_environment(tmp_path: Path) -> None:
     done = release(ROOT / "deploy" / "release", str(tmp_path))
-    assert done.returncode == 0, done.stderr
-    assert "release: a state repo, a check of it, a demand\nrelease: ready: " in done.stdout
+    assert done.code == 0, done.err
+    assert "release: a state repo, a check of it, a demand\nrelease: ready: " in done.out
     assert zipfile.is_zipfile(tmp_path / f"{NAME}-py3-none-any.whl")
     with tarfile.open(tmp_path / f"{NAME}.tar.gz") as sdist:
         assert f"{NAME}/pyproject.toml" in sdist.getnames()
@@ -135,8 +137,8 @@ def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_pa
         "launch/detector.launch.xml",
         "launch/parameter_sync.launch.xml",
     }
-    for program in ("detect", "parameter_sync", "serve"):
-        assert os.access(tmp_path / "lib" / "demandops_ros" / program, os.X_OK)
+    for name in ("detect", "parameter_sync", "serve"):
+        assert os.access(tmp_path / "lib" / "demandops_ros" / name, os.X_OK)
 
 
 STAND_INS = {
@@ -150,20 +152,19 @@ MIRROR = "http://mirror.invalid"
 def test_an_image_has_the_release_and_the_sources_of_the_machine(tmp_path: Path) -> None:
     root, called, sources = (tmp_path / name for name in ("root", "called", "sources"))
     for name, text in STAND_INS.items():
-        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
-        (tmp_path / name).chmod(0o755)
+        program(tmp_path / name, text)
     env = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
     env |= {"SOURCES": str(sources), "CALLED": str(called), "ROOT": str(root)}
     command = ["sh", str(ROOT / "deploy" / "image"), str(tmp_path / "image")]
     name = platform.freedesktop_os_release()["VERSION_CODENAME"]
-    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
-    assert (done.returncode, called.exists()) == (1, False)
-    assert f"apt has no source of {name}" in done.stderr
+    done = process(*command, env=env)
+    assert (done.code, called.exists()) == (1, False)
+    assert f"apt has no source of {name}" in done.err
     parts = ("-security {}/security main", " {}/packages main", " {}/packages contrib")
     lines = [f"{name}{part.format(MIRROR)}\n" for part in parts]
     sources.write_text("".join(lines) + f"other {MIRROR}/other main\n")
-    done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    done = process(*command, env=env)
+    assert done.code == 0, done.err
     assert called.read_text() == f"--variant=minbase {name} {root} {MIRROR}/packages\n"
     assert (root / "etc/apt/sources.list").read_text().splitlines() == [
         f"deb {MIRROR}/packages {name} contrib",

@@ -7,7 +7,6 @@ import logging
 import re
 import resource
 import signal
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -30,9 +29,10 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import qos_profile_action_status_default
 from rosgraph_msgs.msg import Clock
 
+from tests.kit.cli import process
 from tests.kit.goals import link as connection
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import Person, git, hook, tip
+from tests.kit.repo import Person, git, hook, keygen, tip
 from tests.kit.ros import Client, Serve, Served
 
 
@@ -116,9 +116,7 @@ def test_a_process_ends_with_0_while_its_executor_has_much_to_do(end: str) -> No
         "node.create_timer(0.001, lambda: None); thread = ExecutorThread(node)\n"
         f"time.sleep(0.2); {end}"
     )
-    command = [sys.executable, "-c", program]
-    ended = subprocess.run(command, check=False, capture_output=True, timeout=PATIENCE_S)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"", b"")
+    assert process(sys.executable, "-c", program) == (0, "", "")
 
 
 def test_a_goal_that_the_journal_cannot_keep_is_rejected_and_the_log_says_why(
@@ -251,8 +249,7 @@ def test_bookkeeping_is_answered_over_ros_by_one_thread(shared: Served, caller: 
 def test_action_name_state_repo_and_log_level_are_ros_parameters_and_commits_are_signed(
     serve: Serve, ros_domain: int, bare: Path, new_repo: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    key = tmp_path / "key"
-    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
+    key = keygen(tmp_path / "key")
     args = ["-p", "action_name:=/demands", "-p", f"state_repo:={bare}", "-p", "log_level:=error"]
     served = serve(new_repo("other.git"), "--signing-key", str(key), "--ros-args", *args)
     client = Client(ros_domain, "/demands")

@@ -102,10 +102,6 @@ def test_a_node_follows_without_a_restart_and_after_one(
     hold(cluster, text="of_edge_fusion: 5")
     fault = f"{FILE_NAME}: of_edge_fusion.ros__parameters: must be a mapping"
     client.wait(lambda: f"{fault}; {TARGET} keeps its parameters" in log.read_text())
-    for value in ("9223372036854775808", "[-9223372036854775809]"):
-        hold(cluster, text=f"of_edge_fusion: {{ros__parameters: {{length: {value}}}}}")
-        fault = f"parameter length: '{value.strip('[]')}' is out of ROS's range"
-        client.wait(lambda fault=fault: fault in log.read_text())
     hold(cluster, "")
     client.wait(lambda: read_by_the_fusion(client) == set())
     times = log.read_text().count(DONE)
@@ -169,10 +165,11 @@ def test_the_example_of_the_scaffold_follows_all_at_once_or_not_at_all(
             node.kill()
 
 
-def test_several_nodes_get_the_types_that_they_have_and_are_asked_again(
+def test_several_nodes_get_the_types_that_they_have_and_what_they_had_before(
     cluster: KubeApi, servers: Servers, client: Client, tmp_path: Path
 ) -> None:
-    nodes = [Node(name, context=client.node.context) for name in ("first", "second")]
+    free = {"context": client.node.context, "allow_undeclared_parameters": True}
+    nodes = [Node(name, **free) for name in ("first", "second")]
     for node in nodes:
         client.executor.add_node(node)
         node.declare_parameter("rate", 0.5)
@@ -181,7 +178,7 @@ def test_several_nodes_get_the_types_that_they_have_and_are_asked_again(
     nodes[1].add_on_set_parameters_callback(
         lambda changes: SetParametersResult(successful=is_ready, reason="not yet")
     )
-    section = {"ros__parameters": {"rate": 10, "ids": [""]}}
+    section = {"ros__parameters": {"rate": 10, "ids": [""], "undeclared": 1}}
     hold(cluster, text=json.dumps({"first": section, "second": section}))
     sync, state = start_sync(servers, tmp_path, "first", "second"), tmp_path / "state"
     client.wait(lambda: nodes[0].get_parameter("rate").value == 10.0)
@@ -191,6 +188,14 @@ def test_several_nodes_get_the_types_that_they_have_and_are_asked_again(
     client.wait(lambda: state.read_text() == "set\n")
     assert nodes[1].get_parameter("rate").value == 10.0
     assert sync.log.read_text().count("not yet") == 1
+    # without the memory of the process that set them first
+    assert sync.stop(signal.SIGTERM) == 0
+    hold(cluster, text="first: {ros__parameters: {ids: [2]}}\nsecond:\n  ros__parameters:\n")
+    start_sync(servers, tmp_path, "first", "second")
+    client.wait(lambda: [n.get_parameter("rate").value for n in nodes] == [0.5, 0.5])
+    client.wait(lambda: state.read_text() == "set\n")
+    assert [list(node.get_parameter("ids").value) for node in nodes] == [[2], [1]]
+    assert not any(node.has_parameter("undeclared") for node in nodes)
     for node in nodes:
         node.destroy_node()
 
@@ -199,6 +204,8 @@ def test_a_value_gets_the_type_of_the_node() -> None:
     kinds = Parameter.Type
     for value, kind, expected in (
         (3, kinds.DOUBLE, kinds.DOUBLE),
+        (3.0, kinds.INTEGER, kinds.INTEGER),
+        (1e300, kinds.INTEGER, kinds.DOUBLE),  # which the node refuses
         (True, kinds.DOUBLE, kinds.BOOL),  # which the node refuses
         ([1, 2], kinds.DOUBLE_ARRAY, kinds.DOUBLE_ARRAY),
         ([1, 2.5], kinds.NOT_SET, kinds.DOUBLE_ARRAY),
@@ -219,6 +226,11 @@ def test_parameters_have_dotted_names_and_a_file_that_gives_a_node_nothing_is_re
         ("- 1", "must map nodes to their parameters"),
         ("other: {}", "node: has no parameters of the node; write node: {ros__parameters: …}"),
         ("node: {}", "node.ros__parameters: must be a mapping"),
+        (
+            "node: {ros__parameters: {a.b: 1, a: {b: 2}}}",
+            "node.ros__parameters.a.b: the parameter 'a.b' is here twice, because dots nest; "
+            "remove one",
+        ),
     ):
         with pytest.raises(InvalidInput) as refused:
             parameters_of("/node", text, "f")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from demandops_ros.detector.replay import REST_OF_BAG, Replay, show
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from tests.kit.cli import Run
+from tests.kit.cli import Run, process
 from tests.kit.detection import POSE, SOURCES, rule, text_of, write_bag
 from tests.kit.goals import EXPERIMENT
 
@@ -56,9 +55,8 @@ def test_a_replay_needs_no_ros(tmp_path: Path) -> None:
         (["--replay", str(tmp_path / "bag")], 0, "vehicle00"),
         ([], 1, "detect needs rclpy, which is not installed"),
     ):
-        command = [sys.executable, "-c", without, "detect", str(RULES), *further]
-        ran = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert (ran.returncode, told in ran.stdout + ran.stderr) == (code, True), ran.stderr
+        ran = process(sys.executable, "-c", without, "detect", RULES, *further)
+        assert (ran.code, told in ran.out + ran.err) == (code, True), ran.err
 
 
 def test_a_bag_gives_the_demands_of_its_poses(demandops: Run, tmp_path: Path) -> None:

@@ -133,6 +133,14 @@ def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
     return _without_nulls(merged(imported, _values(folder, files)))
 
 
+def takes_parameters(folder: str, files: Mapping[str, str]) -> bool:
+    # whether its `parameters` are those of ROS nodes, as with a library that can reconfigure them
+    return any(
+        needed.name == LIBRARY and "reconfigure:" in files.get(f"{needed.folder}/values.yaml", "")
+        for needed in dependencies(folder, files)
+    )
+
+
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     # by Helm's rules: null removes what is below it, and stays where nothing is
     result = dict(below)

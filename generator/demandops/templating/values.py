@@ -23,6 +23,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path
 from demandops.base.quantities import amount_of
 from demandops.base.quoting import quoted
+from demandops.base.ros_parameters import exact_numbers, flat_parameters
 from demandops.templating import charts
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
 
@@ -190,6 +191,8 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
         values = charts.overridden(values, patch, below)
         if task.chart:
             _check(values, task.chart, files, override, "the override")
+    if task.chart and "parameters" in values and charts.takes_parameters(task.chart, files):
+        values = values | {"parameters": exact_numbers(values["parameters"])}
     return values
 
 
@@ -273,21 +276,20 @@ def _mapping(text: str, template: str) -> dict[str, Any]:
 def _check(
     values: Mapping[str, Any], chart: str, files: Mapping[str, str], origin: str, author: str
 ) -> None:
-    path = f"{chart}/values.schema.json"
-    if path not in files:
-        return
-    schema = validator(files[path], path)
-    # as Helm does, because a schema may require a value that has a default
-    merged = charts.merged(charts.defaults(chart, files), values)
-    faults = [
-        fault(
-            f"values.{place}" if place else "values", f"{error.message}; fix {author} or {chart}"
-        ).within(origin)
-        for error in schema.iter_errors(merged)
-        for place in [field_path(tuple(error.instance_path))]
-    ]
+    path, merged, faults = f"{chart}/values.schema.json", values, list[Fault]()
+    if path in files:
+        # as Helm does, because a schema may require a value that has a default
+        merged = charts.merged(charts.defaults(chart, files), values)
+        for error in validator(files[path], path).iter_errors(merged):
+            place = field_path(("values", *error.instance_path))
+            faults.append(fault(place, f"{error.message}; fix {author} or {chart}"))
+    if charts.takes_parameters(chart, files) and isinstance(merged.get("parameters"), dict):
+        try:
+            flat_parameters(merged["parameters"], "values.parameters")
+        except InvalidInput as error:
+            faults += error.faults
     if faults:
-        raise InvalidInput(faults)
+        raise InvalidInput(each.within(origin) for each in faults)
 
 
 @lru_cache(maxsize=256)

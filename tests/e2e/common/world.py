@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +16,7 @@ import yaml
 
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Kube, Manifest
+from tests.kit.cli import PROGRAM, process
 from tests.kit.repo import Person, git
 from tests.kit.ros import Client, Sent, Served, Servers
 
@@ -173,12 +172,9 @@ class World:
 
 
 def demandops(folder: Path, *arguments: str, or_exit: int = 0) -> str:
-    command = [sys.executable, "-m", "demandops.cli.main", *arguments]
-    done = subprocess.run(
-        command, env=environment(folder), cwd=folder, capture_output=True, text=True, check=False
-    )
-    assert done.returncode in (0, or_exit), f"demandops {' '.join(arguments)}: {done.stderr}"
-    return done.stdout
+    ran = process(*PROGRAM, *arguments, env=environment(folder), cwd=folder, timeout=None)
+    assert ran.code in (0, or_exit), f"demandops {' '.join(arguments)}: {ran.err}"
+    return ran.out
 
 
 def environment(folder: Path) -> dict[str, str]:

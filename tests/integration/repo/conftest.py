@@ -8,9 +8,9 @@ from demandops.serve import agenda
 
 from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server, serving
-from tests.kit.repo import Person
+from tests.kit.repo import Person, program
 
-SSH = """#!/bin/bash
+SSH = """\
 for last; do :; done
 case $last in
   git-receive-pack*)
@@ -65,9 +65,7 @@ def ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     While `ssh.push` or `ssh.fetch` exists, it is silent at pushes or fetches. With the variable
     SAYS, it refuses pushes with these words, unless `ssh.open` exists.
     """
-    program = tmp_path / "ssh"
-    program.write_text(SSH)
-    program.chmod(0o755)
-    monkeypatch.setenv("GIT_SSH_COMMAND", str(program))
+    ssh = program(tmp_path / "ssh", SSH, "/bin/bash")
+    monkeypatch.setenv("GIT_SSH_COMMAND", str(ssh))
     monkeypatch.setenv("GIT_SSH_VARIANT", "ssh")
-    return program
+    return ssh

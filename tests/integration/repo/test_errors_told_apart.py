@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import socket
-import subprocess
-import sys
 from pathlib import Path
 
 import pygit2
@@ -20,7 +18,7 @@ from demandops.repo.history.commit_message import generator_signature
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
-from tests.kit.cli import Run
+from tests.kit.cli import PROGRAM, Run, process
 from tests.kit.connections import IMAGES
 from tests.kit.limits import files_end_at
 from tests.kit.memory import NOW
@@ -225,11 +223,10 @@ def test_a_file_that_the_state_in_effect_had_and_git_lost_is_told(
         person.change({IMAGES: "kind: [\n"})
         rig.book(generator, goal(1))
     lost = rig.lose(bare, f"{valid}:{IMAGES}")
-    command = [sys.executable, "-m", "demandops.cli.main", "bookkeeping", "--state-repo", str(bare)]
-    told = subprocess.run(command, capture_output=True, text=True, check=False)  # without caches
-    assert told.returncode == 1, told.stderr
-    assert f"{IMAGES} of commit {valid[:10]}" in told.stderr
-    assert lost in told.stderr
+    told = process(*PROGRAM, "bookkeeping", "--state-repo", bare)  # without caches
+    assert told.code == 1, told
+    assert f"{IMAGES} of commit {valid[:10]}" in told.err
+    assert lost in told.err
 
 
 def test_a_checkout_that_lacks_a_file_is_told_by_check(

@@ -17,6 +17,7 @@ import pytest
 
 from tests.kit import rig
 from tests.kit.git_over_http import Server
+from tests.kit.repo import keygen
 from tests.kit.rig import goal, wait_until
 
 # The second line of the input lets it submit a demand; it ends only if it is killed.
@@ -122,8 +123,7 @@ def test_a_clone_over_ssh_ends_with_its_generator(bare: Path, ssh: Path) -> None
 def test_a_signature_that_an_agent_does_not_give_ends_with_its_generator(
     bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    key = tmp_path / "key"
-    subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", key], check=True)
+    key = keygen(tmp_path / "key")
     key.unlink()  # so that only an agent can sign
     with socket.socket(socket.AF_UNIX) as agent, tempfile.TemporaryDirectory() as short:
         agent.bind(f"{short}/agent")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
-import sys
 import threading
 from hashlib import sha256
 from pathlib import Path
@@ -20,8 +18,10 @@ from demandops.serve import approvals
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, plain_yaml, rig
+from tests.kit.cli import PROGRAM, process
 from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server
+from tests.kit.repo import program
 from tests.kit.rig import NOW, Person, Proposed, Stages, goal
 
 TABLES = plain_yaml.beside(__file__)
@@ -61,10 +61,9 @@ def test_a_remote_that_cannot_be_read_is_told_with_its_reason(
     says: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The message leaves out git's last lines, which are the same whatever the reason is."""
-    ssh, words = tmp_path / "ssh", "\n".join(says)
+    words = "\n".join(says)
     begun = "printf '000eversion 2\\n'\n" if len(says) > 1 else ""
-    ssh.write_text(f'#!/bin/sh\n{begun}echo "{words}" >&2\nexit 255\n')
-    ssh.chmod(0o755)
+    ssh = program(tmp_path / "ssh", f'{begun}echo "{words}" >&2\nexit 255')
     monkeypatch.setenv("GIT_SSH_COMMAND", str(ssh))
     reason = f"^ssh://edge/state.git cannot be fetched: {re.escape(says[0])}{told}"
     with pytest.raises(StateRepoError, match=reason):
@@ -225,27 +224,17 @@ def test_a_persons_settings_for_git_do_not_reach_the_generators_git(
     (home / ".gitconfig").write_text("".join(f"[{k}]\n {v}\n" for k, v in settings.items()))
     (tmp_path / "demand.yaml").write_text(yaml.safe_dump(goals.put("d", "user")))
     environment = {key: text for key, text in os.environ.items() if key != "GIT_CONFIG_GLOBAL"}
-    command = [sys.executable, "-m", "demandops.cli.main", "request", "--state-repo", http]
-
-    def request() -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [*command, "demand.yaml"],
-            cwd=tmp_path,
-            env=environment | {"HOME": str(home)},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-
+    environment["HOME"] = str(home)
+    request = (*PROGRAM, "request", "--state-repo", http, "demand.yaml")
     branches = rig.branches(bare)
-    ran = request()
-    assert (ran.returncode, ran.stderr) == (0, ""), ran
+    ran = process(*request, cwd=tmp_path, env=environment)
+    assert (ran.code, ran.err) == (0, ""), ran
     assert rig.branches(bare) == branches
     rig.assert_sound(bare)
     (home / ".gitconfig").write_text("[user]\n name = x\n[broken\n")
-    ran = request()
-    assert ran.returncode == 0, ran
-    assert f"{home}/.gitconfig:3" in ran.stderr and "mend that line" in ran.stderr
+    ran = process(*request, cwd=tmp_path, env=environment)
+    assert ran.code == 0, ran
+    assert f"{home}/.gitconfig:3" in ran.err and "mend that line" in ran.err
 
 
 # ---- a running generator follows what people merge, even if no demand comes ----

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import pytest
 from demandops.repo import reader
 
 from tests.kit import goals, rig
-from tests.kit.repo import FORGER, git, read
+from tests.kit.repo import FORGER, git, keygen, read
 from tests.kit.rig import Person, goal
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
@@ -50,9 +49,7 @@ def test_a_parameter_forges_no_message(bare: Path, person: Person, text: str) ->
 def test_where_keys_are_listed_an_unsigned_commit_is_a_persons(
     bare: Path, person: Person, tmp_path: Path
 ) -> None:
-    key = tmp_path / "key"
-    command = ["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "", "-f", str(key)]
-    subprocess.run(command, check=True)
+    key = keygen(tmp_path / "key")
     person.change({"policy/allowed-signers": f"generator {Path(f'{key}.pub').read_text()}"})
     with rig.running(bare, signing_key=key) as generator:
         rig.book(generator, goal(1))

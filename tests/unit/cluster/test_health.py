@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from copy import deepcopy
 from operator import itemgetter
 from typing import Any
 
@@ -41,42 +43,33 @@ SOURCE = ("GitRepository", "ns", "demandops")
 HELM = ("HelmRelease", "ns", "od-edge")
 
 
-def kustomization(applied: str = "", attempted: str = "", *conditions: Any) -> dict[str, Any]:
-    status = {"lastAppliedRevision": applied and f"main@sha1:{applied}"}
+def kustomization(applied: str, attempted: str, conditions: Iterable[Any] = ()) -> dict[str, Any]:
+    status: dict[str, Any] = {"lastAppliedRevision": applied and f"main@sha1:{applied}"}
     status["lastAttemptedRevision"] = attempted and f"main@sha1:{attempted}"
-    spec = {"sourceRef": {"name": "demandops"}}
-    return {"metadata": {}, "spec": spec, "status": status | {"conditions": list(conditions)}}
+    status["conditions"] = [condition(*one) for one in conditions]
+    return {"metadata": {}, "spec": {"sourceRef": {"name": "demandops"}}, "status": status}
 
 
-def release(*conditions: Any, observed: int = 2) -> dict[str, Any]:
-    status = {"observedGeneration": observed, "conditions": list(conditions)}
+def release(conditions: Iterable[Any] = (), observed: int = 2) -> dict[str, Any]:
+    listed = [condition(*one) for one in conditions]
+    status = {"observedGeneration": observed, "conditions": listed}
     return {"metadata": {"generation": 2}, "status": status}
 
 
 @pytest.mark.parametrize("case", FLUX_CASES["domain"], ids=itemgetter("when"))
 def test_an_access_domain_is_as_far_as_its_kustomization(case: Case) -> None:
-    objects: dict[tuple[str, str, str], Any] = {}
-    if "over" in case:
-        over = case["over"]
-        conditions = [condition(*one) for one in over.get("conditions", ())]
-        objects[OVER] = kustomization(over["applied"], over["attempted"], *conditions)
+    objects = {OVER: kustomization(**case["over"])} if "over" in case else {}
     if "source" in case:
         conditions = [condition(*one) for one in case["source"]]
         objects[SOURCE] = {"metadata": {}, "status": {"conditions": conditions}}
-    health = FLUX.domain_health(PLACE, "b", objects, COMMITS)
-    assert told(health, case) == case
+    assert told(FLUX.domain_health(PLACE, "b", objects, COMMITS), case) == case
 
 
 @pytest.mark.parametrize("case", FLUX_CASES["release"], ids=itemgetter("when"))
 def test_a_release_is_healthy_when_helm_and_all_its_deployments_are(case: Case) -> None:
-    objects = deployments(case)
-    if "helm" in case:
-        conditions = [condition(*one) for one in case["helm"].get("conditions", ())]
-        objects[HELM] = release(*conditions, observed=case["helm"].get("observed", 2))
-    health = FLUX.release_health(
-        targets_in(PLACE)[case.get("of", "service")], "b", objects, COMMITS
-    )
-    assert told(health, case) == case
+    objects = deployments(case) | ({HELM: release(**case["helm"])} if "helm" in case else {})
+    target = targets_in(PLACE)[case.get("of", "service")]
+    assert told(FLUX.release_health(target, "b", objects, COMMITS), case) == case
 
 
 def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
@@ -87,7 +80,7 @@ def test_the_whole_is_as_far_as_its_least_and_a_failure_is_told_first() -> None:
 
 
 def test_since_when_is_the_cluster_s_to_say() -> None:
-    found = {HELM: release(condition("Ready", "True"))}
+    found = {HELM: release([("Ready", "True")])}
     service, client, _ = targets_in(PLACE).values()
     assert FLUX.last_transition(service, found) == "2026-05-04T12:00:00Z"
     assert FLUX.last_transition(client, found) == ""
@@ -113,50 +106,35 @@ def test_a_domain_is_idle_once_the_last_fetch_is_applied(case: Case) -> None:
             "status": {"artifact": artifact, "lastHandledReconcileAt": handled},
         }
         applied, attempted, ready = case["applies"]
-        objects[OVER] = kustomization(applied, attempted, condition("Ready", ready))
+        objects[OVER] = kustomization(applied, attempted, [("Ready", ready)])
     assert Flux().is_idle(PLACE, objects, before="1") is case["idle"]
 
 
 def test_a_domain_that_was_never_asked_to_fetch_is_idle() -> None:
     never = {"metadata": {}, "status": {"artifact": {"revision": "main@sha1:a"}}}
-    objects = {SOURCE: never, OVER: kustomization("a", "a", condition("Ready", "True", "applied"))}
+    objects = {SOURCE: never, OVER: kustomization("a", "a", [("Ready", "True", "applied")])}
     assert Flux().is_idle(PLACE, objects, before=None)
     assert Flux().handled_request(PLACE, objects) == ""
 
 
 # ---- Argo CD ----
 
-URL = "https://git.example/fleet.git"
 IN_ARGOCD = ClusterDomain(
     "c-its", "perception", "ns", ObjectSelector("Application", "argocd", "demandops-perception")
 )
 ARGOCD = health_reader(IN_ARGOCD)
-FOLDER = {"repoURL": URL, "path": "clusters/c-its/perception", "targetRevision": "main"}
-CHART = "appdefs/od/charts/od"
 APPLICATION = ("Application", "argocd", "demandops-perception")
 CHILD = ("Application", "ns", "od-edge")
 AT = "2026-05-04T12:00:00Z"
-
-
-def source(**values: Any) -> dict[str, Any]:
-    helm = {"releaseName": "od-edge", "valuesObject": values}
-    return {"repoURL": URL, "path": CHART, "targetRevision": "main", "helm": helm}
 
 
 def nested(depth: int) -> list[Any]:
     return [nested(depth - 1)] if depth else []
 
 
-SOURCES: dict[str, dict[str, Any]] = {
-    "folder": FOLDER,
-    "elsewhere": {**FOLDER, "path": "clusters/x"},
-    "new": source(inputs=2),
-    "old": source(inputs=1),
-    "sparse": {**source(inputs=[], image=None, port=1), "directory": {"recurse": True}},
-    "written out": {**source(port=1), "directory": {"recurse": True, "jsonnet": {}}},
-    "deep": source(image=nested(900)),
-    "registry": {"repoURL": "oci://r.example/od", "path": ".", "targetRevision": "1.2.0"},
-}
+SOURCES: dict[str, dict[str, Any]] = ARGOCD_CASES["sources"]
+SOURCES["deep"] = deepcopy(SOURCES["new"])
+SOURCES["deep"]["helm"]["valuesObject"] = {"image": nested(900)}
 
 
 def application(default: str, **fields: Any) -> dict[str, Any]:

@@ -14,22 +14,13 @@ from demandops.model.demand.goals import read_goal
 from demandops.model.ledger import records
 from demandops.model.ledger.records import WaitingDemand
 
+from tests.kit import plain_yaml
 from tests.kit.config import state_of
 from tests.kit.goals import put
 from tests.kit.memory import NOW, MemoryRepo, rebuilt
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"kind": "Other"},
-        {"since": "soon"},
-        {"x": 1},
-        {"goal": {"id": "a", "apps": []}},
-        {"goal": {"kind": "Demand", "demand": "b", "requesters": ["v"]}},
-        {"goal": {"kind": "Demand", "operation": "release", "demand": "a", "requesters": ["v"]}},
-    ],
-)
+@pytest.mark.parametrize("change", plain_yaml.beside(__file__), ids=str)
 def test_a_file_that_a_person_broke_holds_nothing(change: dict[str, Any]) -> None:
     waiting = WaitingDemand(read_goal(put("a")), NOW)
     path, text = records.waiting_path("a"), records.waiting_text(waiting)

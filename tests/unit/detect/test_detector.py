@@ -23,19 +23,11 @@ EVENTS, DEMANDS, BOOKED = (
     plain_yaml.beside(__file__, name) for name in ("events", "wanted_demands", "booked_demands")
 )
 NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
-LEVELS = {"start": 2, "stop": 1}
 POSITIONS = [{"node": "n", "x": "{x}"}]
-REQUEST = {
-    "id": "station/perception",
-    "connections": [{"id": "{entity}/edge", "requester_ids": ["{entity}", "station"]}],
-}
-RULES = [
-    rule("joins", near=NEAR, deploymentRequest=REQUEST, entities=["car*"]),
-    rule("puts", near=NEAR, entities=["bus*"]),
-    rule("pair", together={"source": "cars", "start": 5, "stop": 8}),
-    rule("full", count={"source": "cars", "point": {"x": 0, "y": 0}, "radius": 9, **LEVELS}),
-    rule("there", near=NEAR, demand=demand(demand="at/{entity}", positions=POSITIONS)),
-]
+RULES, MANY_RULES = (
+    [rule(name, **fields) for name, fields in rules.items()]
+    for rules in (BOOKED["rules"], plain_yaml.beside(__file__, "many_rules"))
+)
 
 
 def entry(*requesters: str) -> dict[str, Any]:
@@ -207,22 +199,8 @@ def test_a_story_of_wanted_demands(story: dict[str, Any]) -> None:
 
 
 TICK = 0.5
-POINT = {"x": 0, "y": 0}
-SQUARE = [{"x": x, "y": y} for x, y in ((10, 10), (30, 10), (30, 30), (10, 30))]
 NAMES = {"cars": ("a", "b", "c", "d"), "bikes": ("a", "e")}
 EVERYBODY = [(source, name) for source, names in NAMES.items() for name in names]
-MANY_RULES = [
-    rule("near", near={"source": "cars", "point": POINT, "start": 10, "stop": 14}),
-    rule("late", near={"source": "cars", "polygon": SQUARE, "start": 0, "stop": 3}, dwell="1s"),
-    rule("some", near={"source": "bikes", "point": POINT, "start": 9, "stop": 30}, entities=["e"]),
-    rule("pair", together={"source": "cars", "start": 5, "stop": 8}),
-    rule("both", together={"source": "cars", "other": "bikes", "start": 6, "stop": 7}, dwell="2s"),
-    rule("duo", together={"source": "cars", "start": 6, "stop": 9}, entities=["a", "b"]),
-    rule(
-        "mix", together={"source": "cars", "other": "bikes", "start": 4, "stop": 9}, entities=["b"]
-    ),
-    rule("full", count={"source": "cars", "point": POINT, "radius": 20, "start": 3, "stop": 1}),
-]
 
 
 def alone(one: dict[str, Any]) -> Iterable[Iterable[tuple[str, str]]]:

@@ -66,6 +66,32 @@ def test_a_file_that_it_includes_and_that_does_not_exist_is_told() -> None:
         assert not found.startswith(f"{TEMPLATE}:{LAST}: {name}; ")
 
 
+def with_parameters(value: object) -> dict[str, str]:
+    """Return files in which a node gets its ROS parameters from the parameter `net`."""
+    net = json.dumps({"net": {"default": value}})
+    text = skeleton()[APPDEF].replace("\nservices:", f"\nparameters: {net}\nservices:")
+    template = skeleton()[TEMPLATE] + "parameters:\n  node: {{ parameters.net }}\n"
+    return {APPDEF: text, TEMPLATE: template}
+
+
+@pytest.mark.parametrize(("value", "place", "told"), LISTED["ros parameters"]["refused"])
+def test_what_ros_cannot_carry_is_refused_with_the_parameter_that_it_comes_from(
+    value: object, place: str, told: str
+) -> None:
+    (found,) = refused(with_parameters(value))
+    assert found.startswith(f"{TEMPLATE}:{LAST + 1}: values.parameters.node.{place}: ")
+    assert told in found
+    assert found.endswith(", or demand another value of the parameter net")
+
+
+def test_numbers_keep_their_type_on_the_way_through_json() -> None:
+    given, written = LISTED["ros parameters"]["taken"]
+    books = MemoryRepo(with_parameters(given))
+    books.send(perception())
+    release = books.objects("HelmRelease")["od-edge-vehicle00"]
+    assert release["spec"]["values"]["parameters"] == {"node": written}
+
+
 @pytest.mark.parametrize("case", LISTED["edited"], ids=itemgetter("is"))
 def test_values_that_do_not_fit_are_told_with_their_lines(case: dict[str, Any]) -> None:
     found = refused(changed({path: case[path] for path in (TEMPLATE, APPDEF) if path in case}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from operator import itemgetter
 from typing import Any
 
 import kubernetes_validate
@@ -11,6 +12,7 @@ import yaml
 from demandops.repo.merge_check.rendered_charts import manifest_faults
 
 from tests.golden.cases import CASES, rendered
+from tests.kit import plain_yaml
 from tests.kit.goals import application, connection, goal, perception
 from tests.kit.memory import MemoryRepo
 from tests.kit.plain_yaml import FAST
@@ -65,21 +67,7 @@ def test_each_access_domain_has_its_own_folder_namespace_and_account() -> None:
     assert folders == {"fleet", "city"}
 
 
-CONFIG = "apiVersion: v1\nkind: ConfigMap\nmetadata: {name: a, namespace: b}\n"
-X, Y = "clusters/c/d/n/x.yaml", "clusters/c/d/n/y.yaml"
-
-
-@pytest.mark.parametrize(
-    ("files", "places"),
-    [
-        ({X: CONFIG + "data: {a: 1}\nfoo: bar\n"}, [(X, "data.a"), (X, "")]),
-        ({X: CONFIG, Y: CONFIG}, [(Y, "metadata.name")]),
-        ({X: f"{CONFIG}---\n{CONFIG}"}, [(X, "metadata.name")]),
-        ({f"clusters/{name}/d/n/x.yaml": CONFIG for name in ("a", "b")}, []),
-    ],
-    ids=["not of the schema", "twice in two files", "twice in a file", "in two clusters"],
-)
-def test_the_check_finds_what_kubernetes_would_refuse(
-    files: dict[str, str], places: list[tuple[str, str]]
-) -> None:
-    assert [(fault.file, fault.field) for fault in manifest_faults(files)] == places
+@pytest.mark.parametrize("case", plain_yaml.beside(__file__), ids=itemgetter("is"))
+def test_the_check_finds_what_kubernetes_would_refuse(case: dict[str, Any]) -> None:
+    found = [[fault.file, fault.field] for fault in manifest_faults(case["files"])]
+    assert found == case["faults"]

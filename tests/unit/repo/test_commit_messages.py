@@ -15,7 +15,6 @@ from demandops.base.quoting import harmless, is_visible, one_line
 from demandops.decide.decision import Decision
 from demandops.decide.state import ReleaseChange
 from demandops.model.config.load import load
-from demandops.model.demand.demand import Decommission
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.history.commit_log import operations_since
 from demandops.repo.history.commit_message import compose, parse
@@ -60,20 +59,8 @@ def messages() -> Iterator[tuple[str, str]]:
     long = join("vehicle00", application="edge/" + "fusion" * 40)
     yield "a long id", commit_message.of_decision(long, "op-1", NOW).split("\n")[0]
     full = MemoryRepo(state=state_of(load(configuration(config=TEXTS["full"]))))
-    release = {"kind": "Demand", "operation": "release", "demand": "d1", "requesters": ["v"]}
-    for wanted in (
-        waiting("d1", "v"),
-        waiting("d2", "solo"),
-        Decommission(id="solo", kinds=frozenset({"requester"})),
-        release,
-    ):
+    for wanted in TEXTS["waiting"]:
         yield "a demand that waits", commit_message.of_decision(full.send(wanted), "op", full.now)
-
-
-def waiting(demand: str, who: str) -> goals.Goal:
-    made = goals.put(demand, who, topic=("/ego", "edge"), node="")
-    made["applications"][0]["place"] = {"role": "edge"}
-    return made
 
 
 def listing() -> str:

@@ -71,22 +71,11 @@ def named(repo: pygit2.Repository) -> dict[str, str]:
     """Names and ids in a repository with more than one branch, as name → whole id."""
     tip, middle, first = (str(commit.id) for commit in repo.walk(repo.references[MAIN].target))
     tag = repo.create_tag("annotated", pygit2.Oid(hex=first), ObjectType.COMMIT, WHO, "a tag")
-    for name, commit in {
-        "refs/tags/plain": middle,
-        "refs/tags/2026-01-30": middle,
-        "refs/heads/demand/a-b": first,
-        "refs/heads/\u00e9": middle,
-        "refs/remotes/origin/tracked": first,
-        "refs/heads/-x": first,
-        f"refs/heads/{tip}": first,
-        f"refs/heads/{middle[:9]}": first,
-        "refs/heads/twice": first,
-        "refs/tags/twice": tip,
-        "refs/stash": first,
-    }.items():
-        repo.references.create(name, pygit2.Oid(hex=commit))
+    ids = {"tip": tip, "middle": middle, "first": first, "tag": str(tag)}
+    for name, commit in TABLES["references"].items():
+        repo.references.create(name.format_map(ids), pygit2.Oid(hex=ids[commit]))
     repo.references.create("refs/tags/folder", repo.TreeBuilder().write())
-    return {"tip": tip, "middle": middle, "first": first, "tag": str(tag)}
+    return ids
 
 
 @pytest.mark.parametrize(

@@ -114,13 +114,7 @@ def test_a_chart_that_does_not_fit_library_or_registry_is_a_fault(
 
 
 def test_the_first_of_two_imports_of_a_value_counts() -> None:
-    imports = "[{name: lib, repository: 'file://../lib', import-values: [first, second]}]"
-    files = {
-        "appdefs/a/Chart.yaml": f"name: a\nversion: 1.0.0\ndependencies: {imports}\n",
-        "appdefs/a/values.yaml": "own: 1\n",
-        "appdefs/lib/values.yaml": "exports:\n  first: {x: 1}\n  second: {x: 2, y: 2, own: 2}\n",
-    }
-    assert charts.defaults("appdefs/a", files) == {"x": 1, "y": 2, "own": 1}
+    assert charts.defaults("appdefs/a", CHANGES["imports"]) == {"x": 1, "y": 2, "own": 1}
 
 
 def test_inputs_reach_one_configmap_and_nothing_else() -> None:

@@ -333,7 +333,10 @@ def plan(world: World, key: ReleaseKey, *, shaped: bool = True) -> Release | Non
     parameters: dict[str, object] = {}
     for name, parameter in sorted(service.parameters.items()):
         giving = [claim for claim in claims if name in claim.application.parameters]
-        parameters[name] = _merged_value(name, parameter, giving) if giving else parameter.default
+        value = _merged_value(name, parameter, giving) if giving else parameter.default
+        if isinstance(parameter.default, float) and value.__class__ is int:
+            value = float(value)  # many programs write 10.0 as 10
+        parameters[name] = value
     requesters = requesters_of(claims)
     version = version_of_service(world, service, claimed)
     topics = [topic for role_topics in inputs.values() for topic in role_topics]
