@@ -103,8 +103,10 @@ class Run:
         try:
             signal.setitimer(signal.ITIMER_VIRTUAL, LONGEST_S)
             self.target.check(value)
-        except self.target.expected:
-            return None
+        except self.target.expected as error:
+            faults = getattr(error, "faults", [])
+            if self.target.names_files and not all(one.file and one.message for one in faults):
+                return AssertionError(f"a fault without a file or message: {faults}")
         except BaseException as error:
             return error
         finally:

@@ -8,7 +8,7 @@ import socket
 import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import cache, wraps
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -60,21 +60,6 @@ def _text(data: bytes) -> str:
 
 def _bytes(paths: Iterable[Path]) -> tuple[bytes, ...]:
     return tuple(dict.fromkeys(path.read_bytes() for path in paths))[:20]
-
-
-def names_its_faults(check: Callable[[Any], object]) -> Callable[[Any], object]:
-    """Return a check that also fails if a fault names no file or says nothing."""
-
-    @wraps(check)
-    def both(value: Any) -> None:
-        try:
-            check(value)
-        except InvalidInput as error:
-            assert error.faults
-            assert all(found.file and found.message for found in error.faults), error.faults
-            raise
-
-    return both
 
 
 @cache
@@ -157,7 +142,6 @@ def _seeds_of(paths: list[str]) -> tuple[bytes, ...]:
     return tuple(bytes([number]) + _CONFIG[path].encode() for number, path in enumerate(paths))
 
 
-@names_its_faults
 def config_file(data: bytes) -> None:
     load(_CONFIG | {_FILES[data[0] % len(_FILES)] if data else "": _text(data[1:])})
 
@@ -166,7 +150,6 @@ def chart_file(data: bytes) -> None:
     chart_values((_CHARTS[data[0] % len(_CHARTS)] if data else "", _text(data[1:])))
 
 
-@names_its_faults
 def chart_values(file: tuple[str, str]) -> None:
     try_configuration(state_of(load(_CONFIG | dict([file]))))
 
@@ -194,7 +177,6 @@ def set_key(data: bytes) -> None:
     strict_yaml.set_key(_text(data), "renderVersion", 2)
 
 
-@names_its_faults
 def claim(data: bytes) -> None:
     text, path = _text(data), "ledger/applications/00/x/x.yaml"
     try:
@@ -224,7 +206,6 @@ def waiting_demand(data: bytes) -> None:
 # ---- files that only one person or one program reads ----
 
 
-@names_its_faults
 def contexts_file(data: bytes) -> None:
     os.environ["XDG_CONFIG_HOME"] = str(_folder())
     target.contexts_file().parent.mkdir(exist_ok=True)
@@ -234,7 +215,6 @@ def contexts_file(data: bytes) -> None:
     assert target.read_contexts() == content
 
 
-@names_its_faults
 def detector_rules(data: bytes) -> None:
     """Check that rules that can be read also compile, accept observations and form goals."""
     file = rule_file.read(_text(data), "rules.yaml")
@@ -423,17 +403,17 @@ TARGETS = (
         values=_near(forms.own_goal(), ANYTHING) | st.dictionaries(KEY, ANYTHING),
         expected=(ValueError, TypeError, AssertionError, AttributeError, OverflowError),
     ),
-    Target(config_file, _seeds_of(_FILES)),
-    Target(chart_file, _seeds_of(_CHARTS)),
-    Target(chart_values, values=_CHANGED_CHARTS),
+    Target(config_file, _seeds_of(_FILES), names_files=True),
+    Target(chart_file, _seeds_of(_CHARTS), names_files=True),
+    Target(chart_values, values=_CHANGED_CHARTS, names_files=True),
     *(
         Target(one, tuple(_CONFIG[path].encode() for path in _FILES))
         for one in (set_key, without_field)
     ),
-    Target(claim, _bytes(_BOOKED)),
+    Target(claim, _bytes(_BOOKED), names_files=True),
     *(Target(one, _seeds(one)) for one in (marker, waiting_demand)),
-    Target(contexts_file, _seeds(contexts_file)),
-    Target(detector_rules, (*_seeds(detector_rules), _RULES.read_bytes())),
+    Target(contexts_file, _seeds(contexts_file), names_files=True),
+    Target(detector_rules, (*_seeds(detector_rules), _RULES.read_bytes()), names_files=True),
     Target(end_of_override, _seeds(end_of_override), expected=(ValueError,)),
     Target(journal_line, (*_seeds(journal_line), journal._sealed(_LINES, "")[0])),
     *(Target(one, _seeds(one)) for one in (commit, address, revision, moment, forge_answer)),

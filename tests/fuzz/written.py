@@ -32,7 +32,7 @@ from hypothesis import strategies as st
 
 from tests.fuzz import Target
 from tests.fuzz.parsers import bare_repo
-from tests.kit import forms
+from tests.kit import forms, plain_yaml
 from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo
 from tests.kit.plain_yaml import FAST
@@ -51,10 +51,6 @@ _SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
 _LAUNCH = re.compile(r"node_name:=[a-z0-9_]+|__node:=[a-z0-9_]+")
 
 
-def _yaml(text: str) -> Any:
-    return yaml.load(text, Loader=FAST)  # noqa: S506 - derives from SafeLoader
-
-
 # ---- rendered files ----
 
 
@@ -63,7 +59,7 @@ def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
     seed, texts = given
     random, files, goal = Random(seed), forms.rich(), forms.own_goal()
     name = random.choice([path for path in files if path.startswith(("inventory", "registry"))])
-    data = _yaml(files[name])
+    data = plain_yaml.load(files[name])
     renamed = {old: random.choice(texts) for old in ("vehicle00", "edge") if random.random() < 0.3}
     for document in (data, goal):
         for *above, key in [*forms.places(document)]:
@@ -75,7 +71,7 @@ def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
         goal = _renamed(goal, old, new)
         for path in files:
             if path.startswith("inventory/"):
-                whole = _renamed(_yaml(files[path]), old, new)
+                whole = _renamed(plain_yaml.load(files[path]), old, new)
                 files[path] = yaml.safe_dump(whole, allow_unicode=True)
     goal["connections"][0]["type"] = random.choice(["mqtt", "zenoh", "ros"])
     return files, goal
@@ -109,7 +105,7 @@ def _fits_kubernetes(document: Any) -> None:
         assert _SUBDOMAIN.fullmatch(metadata["name"]), metadata["name"]
     for name, content in (document.get("data") or {}).items():
         if name.endswith((".yaml", ".json5")):
-            assert isinstance(_yaml(content), dict), content
+            assert isinstance(plain_yaml.load(content), dict), content
         if name.endswith(".json5"):
             assert pyjson5.decode(content) == json.loads(content)
     for container in (pod.get("spec") or {}).get("containers") or ():
@@ -138,7 +134,7 @@ def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
     text = override_text("x", wanted)
     data = strict_yaml.load(text)
     assert {key: data[key] for key in wanted} == wanted
-    assert text.startswith("# yaml-language-server: ") and _yaml(text) == data
+    assert text.startswith("# yaml-language-server: ") and plain_yaml.load(text) == data
     Override.from_file("x", parse_file(OverrideFile, text, "overrides/x.yaml"))
 
 
