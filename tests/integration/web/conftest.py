@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,8 +33,6 @@ owner: traffic-control
 select: [{connections: [vehicle01/edge]}]
 deny: true
 """
-
-Look = Callable[..., Page]
 
 
 @dataclass(frozen=True)
@@ -80,26 +78,6 @@ def still(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
     bare = tmp_path_factory.mktemp("still") / "state.git"
     with showing(Path(shutil.copytree(bare_template, bare))) as made:
         yield made
-
-
-@pytest.fixture
-def booked(shown: Shown) -> Generator:
-    return shown.generator
-
-
-@pytest.fixture
-def follower(shown: Shown) -> Follower:
-    return shown.follower
-
-
-@pytest.fixture
-def client(shown: Shown) -> TestClient:
-    return shown.client
-
-
-@pytest.fixture
-def look(shown: Shown) -> Look:
-    return shown.look
 
 
 def causes(source: Source, text: str = "") -> list[Cause]:
