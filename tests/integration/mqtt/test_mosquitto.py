@@ -40,7 +40,6 @@ Ends = dict[str, Pod]
 
 @pytest.fixture(scope="module")
 def pods(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Ends:
-    """Return the pods of both ends, whose init containers have run."""
     made = MemoryRepo({"inventory/brokers.yaml": broker.inventory()}).decide(routes(DEMAND))
     manifests = {
         side: text
@@ -58,7 +57,6 @@ def pods(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Ends:
 
 @pytest.fixture
 def connect(pods: Ends) -> Iterator[Callable[..., Client]]:
-    """Return a function that connects the client of one end, with some parameters replaced."""
     opened: list[Client] = []
 
     def client(side: str, **changed: Any) -> Client:

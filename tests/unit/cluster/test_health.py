@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import deepcopy
 from operator import itemgetter
 from typing import Any
 
@@ -118,37 +119,22 @@ def test_a_domain_that_was_never_asked_to_fetch_is_idle() -> None:
 
 # ---- Argo CD ----
 
-URL = "https://git.example/fleet.git"
 IN_ARGOCD = ClusterDomain(
     "c-its", "perception", "ns", ObjectSelector("Application", "argocd", "demandops-perception")
 )
 ARGOCD = health_reader(IN_ARGOCD)
-FOLDER = {"repoURL": URL, "path": "clusters/c-its/perception", "targetRevision": "main"}
-CHART = "appdefs/od/charts/od"
 APPLICATION = ("Application", "argocd", "demandops-perception")
 CHILD = ("Application", "ns", "od-edge")
 AT = "2026-05-04T12:00:00Z"
-
-
-def source(**values: Any) -> dict[str, Any]:
-    helm = {"releaseName": "od-edge", "valuesObject": values}
-    return {"repoURL": URL, "path": CHART, "targetRevision": "main", "helm": helm}
 
 
 def nested(depth: int) -> list[Any]:
     return [nested(depth - 1)] if depth else []
 
 
-SOURCES: dict[str, dict[str, Any]] = {
-    "folder": FOLDER,
-    "elsewhere": {**FOLDER, "path": "clusters/x"},
-    "new": source(inputs=2),
-    "old": source(inputs=1),
-    "sparse": {**source(inputs=[], image=None, port=1), "directory": {"recurse": True}},
-    "written out": {**source(port=1), "directory": {"recurse": True, "jsonnet": {}}},
-    "deep": source(image=nested(900)),
-    "registry": {"repoURL": "oci://r.example/od", "path": ".", "targetRevision": "1.2.0"},
-}
+SOURCES: dict[str, dict[str, Any]] = ARGOCD_CASES["sources"]
+SOURCES["deep"] = deepcopy(SOURCES["new"])
+SOURCES["deep"]["helm"]["valuesObject"] = {"image": nested(900)}
 
 
 def application(default: str, **fields: Any) -> dict[str, Any]:

@@ -65,27 +65,6 @@ def test_a_further_topic_restarts_who_cannot_read_it_and_a_further_requester_nob
     assert sum(one != before[1][name] for name, one in configurations(repo).items()) == 2
 
 
-def test_no_two_connections_share_an_mqtt_topic_or_a_client_id() -> None:
-    repo = MemoryRepo()
-    ids = ("c", "c/d", "c_d", "C", "c-source", "c/source", "+", "#", "$SYS/x", "a/+/b", "/", "//")
-    for number, id in enumerate(ids):
-        targets = [f"/d{number}", f"/c/d{number}"]
-        repo.send(goal([], [connection(id, topics=["/d", "/c/d"], targets=targets)], id=id))
-    topics = []
-    for name, whole in configurations(repo).items():
-        parameters = whole["/**/*"]["ros__parameters"]
-        assert parameters["client"]["id"] == name
-        bridge = parameters["bridge"].get("mqtt2ros", {})
-        topics += bridge.get("mqtt_topics", [])
-        sent = parameters["bridge"].get("ros2mqtt", {})
-        topics += [sent[topic]["mqtt_topic"] for topic in sent.get("ros_topics", [])]
-    assert len(pods(repo)) == 2 * len(ids)
-    assert len({*topics}) == 2 * len(ids), "each topic is at both ends of one connection"
-    assert all(topics.count(topic) == 2 for topic in topics)
-    # neither wildcards nor a dollar
-    assert all(re.fullmatch(r"[a-z0-9-]+(/[A-Za-z0-9_]+)+", topic) for topic in topics)
-
-
 def test_what_is_not_configured_is_left_out_and_an_ipv6_host_becomes_part_of_a_url() -> None:
     brokers = skeleton()["inventory/brokers.yaml"] + "    tls: {}\n"
     brokers = brokers.replace("host: service-mqtt-broker-edge.default.svc", 'host: "2001:db8::1"')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from math import cos, hypot, pi, radians, sin
+from operator import itemgetter
 from types import SimpleNamespace as Message
 from typing import Any
 
@@ -25,6 +26,7 @@ Turn = tuple[float, float, float, float]  # x, y, z, w
 STRAIGHT: Turn = (0.0, 0.0, 0.0, 1.0)
 HOT = {"source": "all", "field": "engine.heat[1]", "above": 90, "stop": 80}
 UNKNOWN = "a_msgs/msg/A"
+TABLES = plain_yaml.beside(__file__)
 
 
 def reader(
@@ -86,7 +88,7 @@ def test_a_message_of_no_use_is_left_out(sent: Message, why: str) -> None:
     assert str(caught.value).startswith(why)
 
 
-@pytest.mark.parametrize(("pattern", "topic", "entity"), plain_yaml.beside(__file__))
+@pytest.mark.parametrize(("pattern", "topic", "entity"), TABLES["entities"])
 def test_an_entity_is_one_part_of_a_topic(pattern: str, topic: str, entity: str | None) -> None:
     assert entity_in(pattern, topic) == entity
 
@@ -183,26 +185,11 @@ def near(point: Place | Point) -> Any:
     return pytest.approx(point, abs=1e-9)
 
 
-def test_a_point_goes_up_to_the_map_by_each_link() -> None:
-    left = turn(90, 0, 0, 1)
-    frames = tree(("odom", "map", (100, 50, 0), left), ("base", "odom", (10, 0, 1), left))
-    assert frames.on_map("odom", (1, 0, 0), 0) == near((100, 51, 0))
-    assert frames.on_map("base", (1, 0, 0), 0) == near((99, 60, 1))
-
-
-def test_the_map_need_not_be_the_root() -> None:
-    frames = tree(
-        ("map", "utm", (1000, 2000, 0), turn(90, 0, 0, 1)),
-        ("car", "utm", (1000, 2005, 0), STRAIGHT),
-    )
-    assert frames.on_map("car", (0, 0, 0), 0) == near((5, 0, 0))
-    assert frames.on_map("utm", (1000, 2000, 0), 0) == near((0, 0, 0))
-
-
-def test_what_a_camera_sees_ahead_is_ahead_on_the_map() -> None:
-    # of a camera, z is ahead and x is to the right
-    frames = tree(("camera", "map", (0, 0, 2), (-0.5, 0.5, -0.5, 0.5)))
-    assert frames.on_map("camera", (3, 0, 20), 0) == near((20, -3, 2))
+@pytest.mark.parametrize("case", TABLES["frames"], ids=itemgetter("is"))
+def test_a_point_of_a_frame_is_on_the_map(case: dict[str, Any]) -> None:
+    links = [(child, parent, moved, turn(*by)) for child, parent, moved, by in case["links"]]
+    for frame, point, wanted in case["points"]:
+        assert tree(*links).on_map(frame, point, 0) == near(wanted)
 
 
 @st.composite

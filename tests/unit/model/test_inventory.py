@@ -37,15 +37,8 @@ from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
 NODES, BROKERS = "inventory/nodes.yaml", "inventory/brokers.yaml"
-VEHICLE: dict[str, Any] = {
-    "type": "vehicle",
-    "cluster": "c-its",
-    "topics": {"ego_data": "/vehicles/{id}/ego_data", "point_cloud": "/{id}/points_{n}"},
-    "position": {"x": "{n}", "y": 7},
-    "zenoh": {"endpoint": "tcp/{id}.fleet:7447"},
-    "bridged": {"edge": ["/vehicles/{id}/time"]},
-}
-BROKER: dict[str, Any] = {"node": "vehicle{n}", "host": "{id}.fleet", "topicPrefix": "v/{n}"}
+PATTERNS = plain_yaml.beside(__file__, "patterns")
+VEHICLE, BROKER = PATTERNS["vehicle"], PATTERNS["broker"]
 
 
 def inventory(*nodes: dict[str, Any], brokers: tuple[dict[str, Any], ...] = ()) -> dict[str, str]:

@@ -10,7 +10,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, Refused
 from demandops.model.config.load import load
 
-from tests.kit import forms
+from tests.kit import forms, plain_yaml
 from tests.kit.forms import Form
 from tests.kit.goals import Goal
 from tests.kit.memory import MemoryRepo
@@ -22,34 +22,11 @@ DOCUMENTS = [
     *((forms.rich, f"overrides/{name}.yaml") for name in ("hold", "deny", "keep", "refuse-new")),
     (forms.rich_with_api, "demandops.yaml"),
 ]
-GOALS = dict(
-    zip(
-        (forms.reference_goal, forms.own_goal),
-        (Form(model.model_json_schema()) for model in forms.GOAL_MODELS),
-        strict=True,
-    )
-)
-PROBES = ("startupProbe", "readinessProbe", "livenessProbe")
-FREE = {
-    *("OverrideFile.values", "Parameter.default", "Application.parameters", "Discovery.entry"),
-    *(f"{kind}ClientSettings.{probe}" for kind in ("", "Mqtt") for probe in PROBES),
+GOALS = {
+    goal: Form(model.model_json_schema())
+    for goal, model in zip((forms.reference_goal, forms.own_goal), forms.GOAL_MODELS, strict=True)
 }
-FREE_PLACES = (
-    *("values", "parameters.rate.default", "parameters.size.oneOf"),
-    *(f"{kind}.{probe}" for kind in ("mqtt", "zenoh", "ros") for probe in PROBES),
-)
-
-
-FREE_IN_GOALS = ("applications[0].parameters", "applications[1].parameters_json")
-ELSEWHERE = {
-    "connections[0].source_topics": "connections[0].target_topics",  # lengths then differ
-    "shutdown": "apps[0].header.id",  # the shutdown finds no claim
-    "connections[0].type": "connections[0].",  # another type has other rules
-    "applications[0].parameters.rate": "parameters.rate",  # the merge finds it
-    "applications[1].place": "applications[1].node",  # then both are missing
-    "applications[1].parameters_json.": "applications[1].parameters.",
-}
-"""Maps a field to a second field, at which a mistake in the first field may be reported."""
+TABLES = plain_yaml.beside(__file__)
 
 
 def form_of(file: str) -> Form:
@@ -91,7 +68,7 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(
         found = faults(whole | {file: "mutated"})
         if file == DOMAINS:  # an invalid domain has no nodes, so overrides have faults too
             found = [one for one in found if one.file == file or "access domain" not in one.message]
-        free = FREE_PLACES if file != "registry/charts.yaml" else ()
+        free = TABLES["free"] if file != "registry/charts.yaml" else ()
         problems.append(forms.problem(mutation, found, form, free=free, file=file))
     assert list(filter(None, problems)) == []
 
@@ -106,13 +83,15 @@ def test_a_mistake_anywhere_in_a_goal_is_a_fault_at_its_place(
     for mutation in forms.mutations(valid(), form.limits()):
         taken = repo.copy().take(mutation.document)
         place = forms.path(mutation.place)
-        also = tuple(field for start, field in ELSEWHERE.items() if place.startswith(start))
+        also = tuple(
+            field for start, field in TABLES["elsewhere"].items() if place.startswith(start)
+        )
         found = [
             fault
             for fault in (taken.faults if isinstance(taken, Refused) else ())
             if mutation.is_at(fault.field) or not fault.field.startswith(also)
         ]
-        problems.append(forms.problem(mutation, found, form, free=FREE_IN_GOALS))
+        problems.append(forms.problem(mutation, found, form, free=TABLES["free in goals"]))
     assert list(filter(None, problems)) == []
 
 
@@ -128,4 +107,4 @@ def test_every_field_of_every_file_and_goal_is_tried() -> None:
 
 def test_only_the_listed_fields_may_have_any_value() -> None:
     every = (*FORMS.values(), *GOALS.values())
-    assert {field for form in every for field in form.free()} == FREE
+    assert {field for form in every for field in form.free()} == {*TABLES["free fields"]}
