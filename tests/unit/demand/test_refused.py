@@ -85,13 +85,6 @@ def test_of_many_faults_of_form_the_first_are_told() -> None:
     assert "applications[0].k0" in {one.field for one in found}
 
 
-def test_parameters_are_bounded() -> None:
-    made = put("d")
-    made["applications"][0]["parameters"] = {"use_sim_time": "x" * 100_000}
-    (found, *_) = MemoryRepo().faults(made)
-    assert found.startswith("applications[0].parameters: have 100020 bytes, but at most 100000 are")
-
-
 def test_of_many_faults_the_first_are_told_and_the_others_counted() -> None:
     found = MemoryRepo().faults(goal([], [connection(topics=["/a b"] * 150)]))
     assert len(found) == 101
