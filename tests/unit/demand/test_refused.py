@@ -120,13 +120,11 @@ _GOAL_MODELS = [
     for part in ("Goal", "Application", "Body", "Connection", "Header", "Topic")
 ]
 KEY = st.sampled_from([name for model in _GOAL_MODELS for name in model.model_fields]) | TEXT
-
-
-def _nested(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    return st.lists(inner, max_size=4) | st.dictionaries(KEY | SCALAR, inner, max_size=5)
-
-
-ANYTHING = st.recursive(SCALAR, _nested, max_leaves=25)
+ANYTHING = st.recursive(
+    SCALAR,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEY | SCALAR, inner, max_size=5),
+    max_leaves=25,
+)
 
 
 def outcome(goal: object) -> Decision | tuple[Fault, ...]:
