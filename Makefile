@@ -29,7 +29,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-processes test-nightly nightly steady test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs image wheel release clean
+.PHONY: help setup demo test test-processes test-nightly nightly steady test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench load simulate mutants docs image wheel release clean
 .PHONY: $(SYSTEM) go
 
 help:  ## List the targets
@@ -153,13 +153,10 @@ golden: setup  ## Rewrite the golden files, and the schemas and tables of the ch
 	@$(PY) -m tests.unit.templating.write
 	@$(PY) -m tests.unit.messages
 
-bench: system-page setup  ## Measure the event detector, the page, and the cost of commits and demands as the ledger grows
+bench: system-page setup  ## Measure the event detector, the page, and what demands and questions cost as the ledger grows
 	@$(PY) -m tests.benchmarks.growth
 	@$(PY) -m tests.benchmarks.detector
 	@$(PY) -m tests.benchmarks.page
-
-bench-audit: setup  ## Measure the cost of an auditor's questions after 10,000 commits
-	@$(PY) -m tests.benchmarks.audit
 
 load: setup  ## Test load: four generators and a person write 2,000 demands at once, while connections are cut
 	@DEMANDOPS_LOAD_DEMANDS=2000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/repo/test_many_writers.py

@@ -2,8 +2,7 @@
 
 The rules get poses of 5,000 entities at 10 Hz, with 100 areas, a rule on pairs and one on a count.
 The node gets poses of more and more entities at 10 Hz until it loses messages. First each entity
-has a topic of its own, then all entities share one topic. What it uses is compared with what a node
-uses that takes the same messages in the same way, and does nothing with them.
+has a topic of its own, then all entities share one topic.
 """
 
 from __future__ import annotations
@@ -27,26 +26,18 @@ from tests.kit.detection import POSE, rule, text_of
 
 ENTITIES, HZ, SECONDS, WIDTH_M = 5000, 10, 4, 10_000
 ROS_SECONDS = 6
-OWN_TOPIC = {"cars": {"topic": "/cars/{entity}/pose", "type": POSE, "timeout": "5s"}}
-ONE_TOPIC = {
-    "cars": {"topic": "/poses", "type": POSE, "entity": "header.frame_id", "timeout": "5s"}
-}
+_CARS = {"topic": "/cars/{entity}/pose", "type": POSE, "timeout": "5s"}
+OWN_TOPIC = {"cars": _CARS}
+ONE_TOPIC = {"cars": _CARS | {"topic": "/poses", "entity": "header.frame_id"}}
 
 
 def rules() -> list[dict[str, Any]]:
     """Return 100 ``near`` rules, a ``together`` rule and a ``count`` rule."""
-    areas = [
-        rule(
-            f"near-{number}",
-            near={
-                "source": "cars",
-                "point": {"x": number % 10 * 1000 + 500, "y": number // 10 * 1000 + 500},
-                "start": 84,
-                "stop": 90,
-            },
-        )
-        for number in range(100)
+    centers = [
+        {"x": x, "y": y} for y in range(500, WIDTH_M, 1000) for x in range(500, WIDTH_M, 1000)
     ]
+    near = {"source": "cars", "start": 84, "stop": 90}
+    areas = [rule(f"near-{n}", near=near | {"point": point}) for n, point in enumerate(centers)]
     middle = {"x": 5000, "y": 5000}
     count = {"source": "cars", "point": middle, "radius": 500, "start": 10, "stop": 5}
     pair = rule("pair", together={"source": "cars", "start": 30, "stop": 35})
@@ -65,12 +56,8 @@ def without_ros() -> None:
         (chance.uniform(0, WIDTH_M), chance.uniform(0, WIDTH_M), chance.uniform(0, 6.28))
         for _ in range(ENTITIES)
     ]
-    state, events, spent = (
-        engine.start(0.0),
-        0,
-        {"deserializing": 0.0, "reading": 0.0, "rules": 0.0},
-    )
-    message = PoseStamped()
+    state, events, message = engine.start(0.0), 0, PoseStamped()
+    spent = dict.fromkeys(("deserializing", "reading", "rules"), 0.0)
     for step in range(1, SECONDS * HZ + 1):
         now, away = step / HZ, step * 13.9 / HZ
         sent = []
@@ -97,49 +84,20 @@ def without_ros() -> None:
     )
 
 
-def alone(*topics: str) -> None:
-    """Take the messages of topics as the detector does, until a signal; print how many."""
-    import rclpy
-    from demandops_ros import ros_process
-    from demandops_ros.detector.detector_node import SourceSubscriptions, _taken
-
-    with ros_process.StopSignals() as signals, ros_process.started([]):
-        node, taken = rclpy.create_node("alone"), 0
-        file = rule_file.read(text_of(*rules()), "rules.yaml")
-        subscribing = SourceSubscriptions(node, file, lambda: 0.0)
-        subscriptions = [subscribing._subscribe(POSE, topic) for topic in topics]
-
-        def take() -> None:
-            nonlocal taken
-            taken += sum(1 for each in subscriptions for _ in _taken(each))
-
-        node.create_timer(0.1, take)
-        thread = ros_process.ExecutorThread(node)
-        signals.wait()
-        thread.close()
-        print(taken)
-
-
-def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, int, float]:
+def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
     """Return how many poses were sent over ROS and read, and the processor's seconds for it."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import PoseStamped
 
-    heard = {"messages": 0}
+    heard, names = {"messages": 0}, [f"car{number}" for number in range(entities)]
+    topics = list(dict.fromkeys(sources["cars"]["topic"].format(entity=name) for name in names))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "rules.yaml")
         path.write_text(text_of(*rules(), sources=sources))
         options = ["-p", "bookkeeping_topic:=''", "-p", f"rules:={path}"]
-        own = "{entity}" in sources["cars"]["topic"]
-        names = [f"car{number}" for number in range(entities)]
-        topics = [f"/cars/{name}/pose" for name in names] if own else ["/poses"]
-        command = ["demandops.cli.main", "detect", "--ros-args", *options]
-        if alone:
-            command = ["tests.benchmarks.detector", *topics]
-        detecting = subprocess.Popen(
-            [sys.executable, "-m", *command], stderr=subprocess.DEVNULL, stdout=subprocess.PIPE
-        )
+        command = [sys.executable, "-m", "demandops.cli.main", "detect", "--ros-args", *options]
+        detecting = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
         rclpy.init()
         node = rclpy.create_node("fleet")
 
@@ -151,7 +109,7 @@ def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, 
         node.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
         publishers = [node.create_publisher(PoseStamped, topic, 1000) for topic in topics]
         message = PoseStamped()
-        while (not alone and heard.get("topics", 0) < len(topics)) or not all(
+        while heard.get("topics", 0) < len(topics) or not all(
             publisher.get_subscription_count() for publisher in publishers
         ):
             rclpy.spin_once(node, timeout_sec=0.1)
@@ -172,8 +130,8 @@ def over_ros(entities: int, sources: dict[str, Any], alone: bool) -> tuple[int, 
         node.destroy_node()
         rclpy.shutdown()
         detecting.terminate()
-        printed, _ = detecting.communicate(timeout=20)
-    return sent, int(printed) if alone else heard["messages"] - before, spent
+        detecting.wait(timeout=20)
+    return sent, heard["messages"] - before, spent
 
 
 def cpu(pid: int) -> float:
@@ -185,19 +143,14 @@ def main() -> None:
     without_ros()
     for what, sources in (("a topic for each", OWN_TOPIC), ("one topic for all", ONE_TOPIC)):
         for entities in (50, 100, 200, 400, 800, 1600):
-            sent, read, spent = over_ros(entities, sources, alone=False)
-            _, taken, spent_alone = over_ros(entities, sources, alone=True)
-            each, each_alone = spent / read * 1e6, spent_alone / taken * 1e6
-            print(
-                f"node, {what}: {entities} entities at {HZ} Hz: {read / sent:.1%} of {sent} "
-                f"messages read, {spent / ROS_SECONDS:.0%} of a core; {each:.0f} us for a message, "
-                f"{each / each_alone:.2f} times as much as to take it alone",
-                flush=True,
-            )
+            sent, read, spent = over_ros(entities, sources)
+            used = f"{spent / ROS_SECONDS:.0%} of a core; {spent / read * 1e6:.0f} us for a message"
+            share = f"{read / sent:.1%} of {sent} messages read"
+            print(f"node, {what}: {entities} entities at {HZ} Hz: {share}, {used}", flush=True)
             if read < 0.99 * sent:
                 break
 
 
 if __name__ == "__main__":
     os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 100)))
-    alone(*sys.argv[1:]) if sys.argv[1:] else main()
+    main()

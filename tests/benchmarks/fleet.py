@@ -8,7 +8,6 @@ makes the claims and the rendered files.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -26,9 +25,6 @@ from demandops.model.demand.goals import read_goal
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.history import commit_message
-from demandops.serve.generator import Generator
-from rich.console import Console
-from rich.table import Table
 
 from tests.kit import goals
 from tests.kit.config import configuration, state_of
@@ -130,35 +126,22 @@ def no_fsync() -> Iterator[None]:
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 
 
-def costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
-    start, worked = time.perf_counter(), time.process_time()
-    generator.submit(goal).future.result()
-    return time.perf_counter() - start, time.process_time() - worked
-
-
 def workspace() -> TemporaryDirectory[str]:
-    """Return a folder for state repos, on the disk of the checkout."""
     BUILD.mkdir(exist_ok=True)
     return TemporaryDirectory(prefix="bench-", dir=BUILD)
 
 
 def report(name: str, **tables: Sequence[Mapping[str, object]]) -> None:
     """Print tables, with the keys of the first row as columns; write build/<name>.json."""
-    out = Console(highlight=False)
     for title, rows in tables.items():
-        made = Table(title=title)
-        for column in rows[0]:
-            made.add_column(column.replace("_", " "), justify="right")
-        for row in rows:
-            made.add_row(*map(_cell, row.values()))
-        out.print(made)
+        cells = [[*rows[0]], *([_cell(value) for value in row.values()] for row in rows)]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        print(title)
+        for row in cells:
+            print(*(cell.rjust(width) for cell, width in zip(row, widths, strict=True)), sep="  ")
     BUILD.mkdir(exist_ok=True)
-    file = BUILD / f"{name}.json"
-    file.write_text(json.dumps(tables, indent=2) + "\n")
-    out.print(f"written to {file}")
+    (BUILD / f"{name}.json").write_text(json.dumps(tables, indent=2) + "\n")
 
 
 def _cell(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:,.2f}"
-    return f"{value:,}" if isinstance(value, int) else str(value)
+    return f"{value:,.2f}" if isinstance(value, float) else str(value)

@@ -19,7 +19,7 @@ from tests.e2e.common.expected import NAMESPACE
 from tests.e2e.common.rendered import DETECTION_TEMPLATE, check_chart
 from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Manifest, build_manifest
-from tests.golden.cases import CASES, whole
+from tests.golden.cases import CASES, rendered
 from tests.kit.cli import Run
 from tests.unit.render.test_inert import HELM_READS, TRAPS, UNSEEN
 
@@ -43,7 +43,7 @@ def golden(gitops: Gitops) -> Iterator[Manifest]:
     seen: set[str] = set()
     cases = sorted(case for case in CASES if case.startswith("argocd-") == (gitops == "argocd"))
     for folder in ("bootstrap/", "clusters/"):
-        for files in (files for case in cases for files in whole(case).values()):
+        for files in (files for case in cases for files in rendered(case).values()):
             for path in sorted(path for path in files if path.startswith(folder)):
                 for manifest in yaml.safe_load_all(files[path]):
                     text = json.dumps(manifest, sort_keys=True)

@@ -1,6 +1,6 @@
 """Inject faults into one demand and report what each did: ``make faults``.
 
-The program writes ``build/faults.json`` and ends with exit code 1 if a promise was broken.
+The exit code is 1 if a promise was broken.
 """
 
 from __future__ import annotations
@@ -8,7 +8,6 @@ from __future__ import annotations
 import argparse
 import gc
 import io
-import json
 import logging
 import os
 import pkgutil
@@ -19,7 +18,7 @@ import traceback
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from multiprocessing import current_process, get_context
 from pathlib import Path
@@ -37,8 +36,7 @@ WORKERS = (os.cpu_count() or 1) + 1
 """One more than there are cores, because a worker that waits for a disk or a lock needs no core."""
 MEMORY = Path("/dev/shm")
 """A file system in memory, where a sync takes no time; strace still shows each sync."""
-OUT = Path(__file__).parents[2] / "build" / "faults.json"
-TELL_EVERY_S = 30
+TELL_EVERY = 20
 _RIGS: dict[tuple[bool, bool], Rig] = {}
 _FOLDER, _SHORT = Path(), True
 
@@ -60,20 +58,16 @@ def main() -> int:
         _prepare(Path(folder))
         tasks = [each for each in _tasks(Path(folder), chosen.long) if chosen.only in str(each)]
         print(f"{len(tasks)} tasks", flush=True)
-        began, told, results = time.monotonic(), 0.0, list[Result]()
+        began, results = time.monotonic(), list[Result]()
         start = (Path(folder), not chosen.long)
         with get_context("fork").Pool(WORKERS, _start, start) as pool:
             for number, found in enumerate(pool.imap_unordered(_run, tasks), 1):
                 results += found
-                seconds = time.monotonic() - began
                 for result in found:
                     for problem in result.problems:
-                        where = " ".join(result.where)
-                        print(f"VIOLATED {result.part} {where} {result.fault}: {problem}")
-                if seconds - told >= TELL_EVERY_S:
-                    told = seconds
-                    left = seconds / number * (len(tasks) - number)
-                    print(f"{number} tasks, {seconds:.0f} s; about {left:.0f} s to go", flush=True)
+                        print(f"VIOLATED {' '.join(result.where)} {result.fault}: {problem}")
+                if number % TELL_EVERY == 0:
+                    print(f"{number} tasks, {time.monotonic() - began:.0f} s", flush=True)
     _report(results, time.monotonic() - began)
     return int(any(result.problems for result in results))
 
@@ -112,7 +106,7 @@ def _tasks(folder: Path, long: bool) -> Iterator[_Task]:
         if not remote:
             yield from (_Task("failed sync", False, (each.n,)) for each in syncs if each.n > 1)
         for job in injection.jobs(sites, remote=remote, short=not long):
-            yield _Task("injection", remote, (job,))
+            yield _Task("injection", remote, job)
 
 
 def _start(folder: Path, short: bool) -> None:
@@ -121,11 +115,12 @@ def _start(folder: Path, short: bool) -> None:
 
 
 def _run(task: _Task) -> list[Result]:
+    part = f"{task.part}, remote:" if task.remote else f"{task.part}:"
     try:
-        return _results(task)
+        return [replace(each, where=(part, *each.where)) for each in _results(task)]
     except Exception as error:  # the other tasks' results must not be lost
         traceback.print_exc()
-        return [Result(task.part, (str(task.what), "", ""), "", (f"not tried: {error!r}",))]
+        return [Result((part, str(task.what)), "", (f"not tried: {error!r}",))]
 
 
 def _results(task: _Task) -> list[Result]:
@@ -153,14 +148,10 @@ def _report(results: list[Result], seconds: float) -> None:
     for result in results:
         known = [f"known and open: {problem}" for problem in result.known]
         verdicts = [*result.problems, *known] or ["sound"]
-        by_class.setdefault(" ".join((result.part, *result.where)), Counter()).update(verdicts)
-    OUT.parent.mkdir(exist_ok=True)
-    in_all = json.loads(OUT.read_text()) if OUT.exists() else {}  # the file counts all runs
+        by_class.setdefault(" ".join(result.where), Counter()).update(verdicts)
     for name, verdicts in sorted(by_class.items()):
-        in_all[name] = Counter(in_all.get(name, {})) + verdicts
         told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
         print(f"{name}: {told}")
-    OUT.write_text(json.dumps(in_all, indent=1, sort_keys=True))
     wrong = sum(bool(result.problems) for result in results)
     known = sum(bool(result.known) for result in results)
     print(

@@ -40,8 +40,7 @@ def full(rig: Rig, folder: Path, blocks: int) -> Result:
         problems = list(after_fault(ran, _ROOM, unsound=False))
         filler.unlink()
         problems += after_restart(rig, ran)
-    where = (file_class(str(folder), rig.folder), f"{blocks} blocks left", "")
-    return Result("full disk, remote" if rig.remote else "full disk", where, "", tuple(problems))
+    return Result((folder.name, f"{blocks} blocks left"), "", tuple(problems))
 
 
 @contextmanager
@@ -103,6 +102,4 @@ def _damaged(rig: Rig, path: Path, name: str, place: int, title: str) -> Result:
         problems.append(f"not mended: {ran.err.strip()[-200:]}")
     if not ran.code and (mendable or "outbox" in name):
         problems += after_restart(rig, Ran(0, "", ""), clones=False)
-    return Result(
-        "damage, remote" if rig.remote else "damage", (name, title, ""), "", tuple(problems)
-    )
+    return Result((name, title), "", tuple(problems))

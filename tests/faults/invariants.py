@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from tests.faults.rig import Ran, Rig, commits_by_demand, includes
+from tests.faults.rig import Ran, Rig, commits_by_demand
+from tests.kit.repo import fsck, git
 
 DEMAND, NEXT = 1, 2
 _DONE, _REFUSED, _UNSOUND, _INTERRUPTED = 0, 1, 3, 130
@@ -72,7 +72,7 @@ def _after_restart(rig: Rig, ran: Ran, *, journaled: bool, clones: bool) -> Iter
         yield f"booked {times} times"
     if journaled and not times:
         yield "journaled and missing"
-    if ran.commit and not includes(rig, ran.commit):
+    if ran.commit and ran.commit not in git(rig.state, "rev-list", "main").split():
         yield "acknowledged and missing"
     if times and '"refused"' in ran.out:
         yield "refused and booked"
@@ -94,16 +94,8 @@ def _state(rig: Rig, numbers: set[int], clones: bool) -> Iterator[str]:
     if verified.code:
         yield f"verify: {(verified.out + verified.err).strip()}"
     for folder in (rig.state, *(rig.home.rglob("clone.git") if clones else ())):
-        checked = subprocess.run(
-            ["git", "-C", folder, "fsck", "--strict", "--no-dangling", "--no-progress"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        lines = (checked.stdout + checked.stderr).splitlines()
-        told = [line for line in lines if not line.startswith("notice: ")]
-        if checked.returncode or told:
-            yield f"git fsck: {' '.join(told)}"
+        if told := fsck(folder):
+            yield f"git fsck: {told}"
         for pattern in _LEFTOVERS:
             yield from (f"left over: {_named(path)}" for path in folder.glob(pattern))
 

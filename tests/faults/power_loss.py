@@ -16,7 +16,7 @@ from pathlib import Path
 from tests.faults.injection import SYNCS, Result
 from tests.faults.invariants import DEMAND, after_restart
 from tests.faults.rig import Ran, Rig, Strace
-from tests.faults.trace import Call, file_class, parse
+from tests.faults.trace import Call
 
 _TRACE = ("-f", "-s", "16000000", "-e", "trace=%file,%desc,%process")
 _FOLDER = -1
@@ -24,28 +24,20 @@ _GONE = -2
 
 
 @dataclass(frozen=True)
-class _Name:
-    """A change of an entry of a folder, safe when the folder is synced."""
+class _Part:
+    """A change of a folder's entry, if it has a ``path``, or of a file: bytes at ``at``, or a cut.
 
-    path: str
+    It is safe when the folder or the file is synced, which is its ``scope``.
+    """
+
     node: int
+    path: str = ""
+    at: int = 0
+    text: bytes | None = None
 
     @property
     def scope(self) -> str | int:
-        return self.path.rpartition("/")[0]
-
-
-@dataclass(frozen=True)
-class _Data:
-    """A change of a file, safe when the file is synced: bytes at an offset, or a cut."""
-
-    node: int
-    at: int
-    text: bytes | None
-
-    @property
-    def scope(self) -> str | int:
-        return self.node
+        return self.path.rpartition("/")[0] or self.node
 
 
 @dataclass
@@ -53,7 +45,7 @@ class _Change:
     """A change by one call or by successive writes; indices of ``parts`` are safe or lost."""
 
     name: str
-    parts: list[_Name | _Data]
+    parts: list[_Part]
     safe: set[int] = field(default_factory=set)
     lost: set[int] = field(default_factory=set)
 
@@ -87,7 +79,7 @@ class Disk:
         elif not call.failed:
             parts = list(self._parts(call, path))
             if parts:
-                change = _Change(f"{call.kind} {file_class(path, self.root)}", parts)
+                change = _Change(f"{call.kind} {call.file}", parts)
                 if self._always_safe and path.startswith(self._always_safe):
                     change.safe = set(range(len(parts)))
                 self._append(change)
@@ -97,13 +89,13 @@ class Disk:
         if self.changes and change.parts and not change.safe:
             last = self.changes[-1]
             parts = [*last.parts, *change.parts]
-            same = all(isinstance(p, _Data) and p.scope == parts[0].scope for p in parts)
+            same = all(not p.path and p.scope == parts[0].scope for p in parts)
             if same and not last.safe and not last.lost:
                 last.parts = parts
                 return
         self.changes.append(change)
 
-    def _parts(self, call: Call, path: str) -> Iterator[_Name | _Data]:
+    def _parts(self, call: Call, path: str) -> Iterator[_Part]:
         kind, flags = call.kind, call.arguments
         if kind in ("openat", "open", "creat"):
             self._places[path] = -1 if "O_APPEND" in flags else 0
@@ -124,7 +116,7 @@ class Disk:
                 self._sizes[node] = max(self._sizes[node], at + len(text))
                 if place >= 0:
                     self._places[path] = at + len(text)
-                yield _Data(node, at, text)
+                yield _Part(node, at=at, text=text)
         elif kind in ("ftruncate", "truncate"):
             yield from self._cut(path, int(flags.rpartition(",")[2]))
         elif kind in ("link", "linkat"):
@@ -136,23 +128,23 @@ class Disk:
         elif kind in ("unlink", "unlinkat", "rmdir") and path in self._names:
             yield self._name(path, _GONE)
 
-    def _renamed(self, old: str, new: str) -> Iterator[_Name]:
+    def _renamed(self, old: str, new: str) -> Iterator[_Part]:
         for path in [p for p in self._names if p == old or p.startswith(f"{old}/")]:
             yield self._name(new + path.removeprefix(old), self._names[path])
             yield self._name(path, _GONE)
 
-    def _cut(self, path: str, at: int) -> Iterator[_Data]:
+    def _cut(self, path: str, at: int) -> Iterator[_Part]:
         node = self._names.get(path, _GONE)
         if node >= 0:
             self._sizes[node] = at
-            yield _Data(node, at, None)
+            yield _Part(node, at=at)
 
-    def _name(self, path: str, node: int) -> _Name:
+    def _name(self, path: str, node: int) -> _Part:
         if node == _GONE:
             self._names.pop(path, None)
         else:
             self._names[path] = node
-        return _Name(path, node)
+        return _Part(node, path)
 
     def _sync(self, path: str, *, worked: bool) -> None:
         """Mark changes as safe, or as lost if the sync failed; a later sync does not help."""
@@ -179,7 +171,7 @@ class Disk:
             for index, part in enumerate(change.parts):
                 if id(change) in left_out and index not in change.safe:
                     continue
-                if isinstance(part, _Name):
+                if part.path:
                     names[part.path] = part.node
                     continue
                 content = data.setdefault(part.node, bytearray())
@@ -205,22 +197,16 @@ def run(rig: Rig) -> Iterator[Result]:
     rig.restore()
     disk = Disk(rig.folder, always_safe=str(rig.state) if rig.remote else "")
     ran = rig.must(rig.book(DEMAND, Strace(_TRACE)))
-    calls = parse(ran.trace, ran.roles, rig.folder)
-    unanswered = Ran(0, "", "")
-    seen: set[tuple[tuple[str, int], ...]] = set()
-    number = 0
-    for call in calls:
+    seen, number = set[object](), 0
+    for call in ran.calls:
         if call.kind in SYNCS:
             number += 1
-            title = f"at sync {number}, {file_class(call.paths[-1], rig.folder)}"
-            yield from _lose(rig, disk, title, unanswered, seen)
+            yield from _lose(rig, disk, f"at sync {number}, {call.file}", Ran(0, "", ""), seen)
         disk.follow(call)
     yield from _lose(rig, disk, "at the answer", ran, seen)
 
 
-def _lose(
-    rig: Rig, disk: Disk, when: str, ran: Ran, seen: set[tuple[tuple[str, int], ...]]
-) -> Iterator[Result]:
+def _lose(rig: Rig, disk: Disk, when: str, ran: Ran, seen: set[object]) -> Iterator[Result]:
     for title, missing in disk.states():
         disk.write(missing)
         files = sorted(path for path in rig.folder.rglob("*") if path.is_file())
@@ -228,10 +214,9 @@ def _lose(
         if state in seen:
             continue
         seen.add(state)
-        part = "power loss, remote" if rig.remote else "power loss"
         if rig.remote:  # the server lost no power, so it leaves no locks
             rig.unlock_server()
-        yield Result(part, (when, title, ""), "", tuple(after_restart(rig, ran)))
+        yield Result((when, title), "", tuple(after_restart(rig, ran)))
 
 
 def failed_sync(rig: Rig, number: int) -> Result:
@@ -246,12 +231,11 @@ def failed_sync(rig: Rig, number: int) -> Result:
     again = rig.must(rig.book(0, Strace(_TRACE)))  # demand 0 is booked already
     files = set()
     for ran in (first, again):
-        for call in parse(ran.trace, ran.roles, rig.folder):
+        for call in ran.calls:
             disk.follow(call)
             if "INJECTED" in call.result:
-                files.add(file_class(call.paths[-1], rig.folder))
+                files.add(call.file)
     unsafe = [change for change in disk.changes if not change.is_safe]
     disk.write(unsafe)
-    where = (f"after a failed sync of {', '.join(files)} and a restart", "", "")
     problems = tuple(after_restart(rig, again, journaled=True))
-    return Result("power loss", where, "EIO", problems)
+    return Result((*files, "and a restart"), "EIO", problems)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import re
 import select
 import shutil
 import signal
@@ -19,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from functools import cache
 from hashlib import sha256
@@ -30,8 +29,9 @@ from uuid import NAMESPACE_OID, uuid5
 import yaml
 from demandops.base.runtime import Runtime
 
+from tests.faults.trace import Call, file_class, parse
 from tests.kit.goals import numbered
-from tests.kit.repo import NO_GIT_CONFIG, commits, git
+from tests.kit.repo import NO_GIT_CONFIG, commits
 
 LIMIT_S = 8.0
 """How many seconds a process that books a demand has until SIGTERM; it needs half a second."""
@@ -41,6 +41,7 @@ PLENTY_S = 300.0
 """How many seconds a command without a fault has; on a busy machine, one needed more than 60."""
 END_S = 8.0
 BEGIN = "/faults-begin"
+_PRINTED = ("out", "err", "trace")
 _FIRST_TIME = datetime(2026, 11, 1, tzinfo=timezone.utc)
 """The time of a rig's first process, of which each further one shows a minute more.
 
@@ -48,12 +49,6 @@ So each run makes the same commits and nearly the same calls, and a rig recogniz
 (:meth:`Rig.fingerprint`).
 """
 _END_WITH_PARENT, _ADOPT_ORPHANS = 1, 36  # PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER
-_CHANCE = re.compile(
-    r"(?<=pack_git2_)[0-9a-f]+?(?=idx|rev|$)|(?<=demandops-pack-)\w+|"
-    r"(?<=tmp_objdir-incoming-)\w+|(?<=tmp_obj_)\w+|(?<=tmp_pack_)\w+|(?<=tmp_idx_)\w+"
-)
-"""The parts of a file's name that a program chooses at random; nothing depends on them."""
-
 GIT = "git"
 """The value of ``Strace.at`` for all processes of git; each process gets a strace of its own."""
 
@@ -67,25 +62,15 @@ class Strace:
 
 
 @dataclass(frozen=True)
-class GitTrace:
-    """What strace printed of process number ``which`` of a git command."""
-
-    command: str
-    which: int
-    folder: str
-    text: str
-
-
-@dataclass(frozen=True)
 class Ran:
     """What a process did; ``lingers``: a child such as ``git push`` outlived it."""
 
     code: int
     out: str
     err: str
-    trace: str = ""
-    roles: dict[int, str] = field(default_factory=dict)
-    git: tuple[GitTrace, ...] = ()
+    calls: tuple[Call, ...] = ()
+    """Those on the rig's files, of whom strace followed."""
+    threads: frozenset[str] = frozenset()
     hangs: str = ""
     lingers: bool = False
 
@@ -166,7 +151,8 @@ class Rig:
         """Return a digest of what the next process will find: the files and the clock's time."""
         told = sha256(str(self._runs).encode())
         for path in sorted(self.folder.rglob("*")):
-            told.update(f"\0{_CHANCE.sub('*', str(path))}\0{path.lstat().st_mode}\0".encode())
+            name = file_class(str(path), self.folder)
+            told.update(f"\0{name}\0{path.lstat().st_mode}\0".encode())
             if path.is_symlink():
                 told.update(str(path.readlink()).encode())
             elif path.is_file():
@@ -186,9 +172,8 @@ class Rig:
     def demandops(
         self, *command: str, strace: Strace | None = None, limit: float = PLENTY_S
     ) -> Ran:
-        paths = {name: self.scratch / name for name in ("out", "err", "trace")}
-        for path in paths.values():
-            path.unlink(missing_ok=True)
+        for name in _PRINTED:
+            (self.scratch / name).unlink(missing_ok=True)
         traces = self.scratch / "traces"
         shutil.rmtree(traces, ignore_errors=True)
         traces.mkdir()
@@ -212,24 +197,14 @@ class Rig:
             os.close(go)
             os.environ.update(environment)
             _make_repeatable(now)
-            _become(command, paths["out"], paths["err"], tell, waits)
+            _become(command, self.scratch / "out", self.scratch / "err", tell, waits)
         os.close(tell)
         os.close(waits)
-        ran = self._watch(process, told, go, strace, paths, limit)
-        return replace(ran, git=tuple(_git_traces(traces)))
+        return self._watch(process, told, go, strace, limit)
 
-    def _watch(
-        self,
-        process: int,
-        told: int,
-        go: int,
-        strace: Strace | None,
-        paths: dict[str, Path],
-        limit: float,
-    ) -> Ran:
+    def _watch(self, process: int, told: int, go: int, strace: Strace | None, limit: float) -> Ran:
         """Wait for the end of a process; trace the thread of ``strace`` from its start."""
-        roles: dict[int, str] = {}
-        alone = 0  # the only traced thread, if any; strace then writes no thread numbers
+        roles = {0: strace.at if strace else ""}
         tracer: subprocess.Popen[str] | None = None
         hangs, status = "", 0
         deadlines = [(limit, signal.SIGTERM), (limit + END_S, signal.SIGKILL)]
@@ -248,8 +223,7 @@ class Rig:
                     name, number = each.rsplit(" ", 1)
                     roles[int(number)] = name
                     if strace is not None and name == strace.at:
-                        tracer = _attach(strace, int(number), paths["trace"])
-                        alone = 0 if "-f" in strace.options else int(number)
+                        tracer = _attach(strace, int(number), self.scratch / "trace")
                     with suppress(BrokenPipeError):  # the process ended as a thread began
                         os.write(go, b".")
             if handle in ready:
@@ -263,14 +237,17 @@ class Rig:
             os.close(end)
         if tracer is not None:
             tracer.communicate()
-        texts = {
-            name: path.read_text(errors="replace") if path.exists() else ""
-            for name, path in paths.items()
-        }
-        if alone:
-            texts["trace"] = "".join(f"{alone} {line}\n" for line in texts["trace"].splitlines())
-        code = os.waitstatus_to_exitcode(status)
-        return Ran(code, roles=roles, hangs=hangs, lingers=_lingers(), **texts)
+        out, err, trace = (_text(self.scratch / name) for name in _PRINTED)
+        calls = (*parse(trace, roles, self.folder), *self._calls_of_git())
+        code, threads = os.waitstatus_to_exitcode(status), frozenset(roles.values())
+        return Ran(code, out, err, calls, threads, hangs, _lingers())
+
+    def _calls_of_git(self) -> Iterator[Call]:
+        for calls in sorted((self.scratch / "traces").glob("*.calls")):
+            command, number = calls.stem.rsplit(" ", 1)
+            folder = calls.with_suffix(".folder").read_text().strip()
+            roles = {0: f"{GIT} {command}"}
+            yield from parse(_text(calls), roles, self.folder, folder, int(number))
 
 
 @cache
@@ -278,12 +255,8 @@ def _git_core() -> Path:
     return Path(subprocess.check_output(["git", "--exec-path"], text=True).strip())
 
 
-def _git_traces(folder: Path) -> Iterator[GitTrace]:
-    for calls in sorted(folder.glob("*.calls")):
-        command, number = calls.stem.rsplit(" ", 1)
-        started_in = calls.with_suffix(".folder").read_text().strip()
-        text = calls.read_text(errors="replace")
-        yield GitTrace(f"{GIT} {command}", int(number), started_in, text)
+def _text(path: Path) -> str:
+    return path.read_text(errors="replace") if path.exists() else ""
 
 
 def _lingers() -> bool:
@@ -360,7 +333,3 @@ def commits_by_demand(rig: Rig) -> dict[int, list[str]]:
         if name.startswith("demand-"):
             found.setdefault(int(name.removeprefix("demand-")), []).append(commit.id)
     return found
-
-
-def includes(rig: Rig, commit: str) -> bool:
-    return commit in git(rig.state, "rev-list", "main").split()

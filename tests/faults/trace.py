@@ -12,7 +12,8 @@ from pathlib import Path
 
 from tests.kit import plain_yaml
 
-_LINE = re.compile(r"(\d+) +(.*)")
+_LINE = re.compile(r"(?:(\d+) +)?(.*)")
+"""A line begins with the number of a process, unless strace follows only one."""
 _CALL = re.compile(r"(\w+)\((.*)\) += (-?\d+|\?|0x[0-9a-f]+)(.*)", re.DOTALL)
 _TEXT = re.compile(r'"((?:[^"\\]|\\.)*)"')
 _FILE = re.compile(r"(?:AT_FDCWD|\d+)<((?:[^>\\]|\\.)*)>")
@@ -30,13 +31,35 @@ _RANDOM = (
 
 @dataclass(frozen=True)
 class Call:
-    process: int
+    """The n-th call of a kind in a thread or process, and the class of file that it touches.
+
+    ``role`` is the name of the thread, or the git command of the process, such as ``git push``. For
+    a thread, ``which`` is 0. For a process, ``which`` is its number, from 1, among the processes of
+    the same git command.
+    """
+
     role: str
     kind: str
+    file: str
     n: int
     arguments: str
     result: str
     paths: tuple[str, ...]
+    which: int = 0
+    place: int = 0
+    """How many calls of the same class came before this one."""
+
+    @property
+    def call_class(self) -> tuple[str, str, str, bool]:
+        return self.role, self.kind, self.file, self.creates
+
+    @property
+    def creates(self) -> bool:
+        return "O_CREAT" in self.arguments
+
+    @property
+    def changes(self) -> bool:
+        return self.kind in calls_of("changes") or self.creates
 
     @property
     def failed(self) -> bool:
@@ -54,24 +77,25 @@ def calls_of(trait: str) -> frozenset[str]:
 
 
 def file_class(path: str, root: Path) -> str:
-    """Return the class of a file: its path below ``root`` without the parts that vary."""
     name = path.removeprefix(f"{root}/")
     for pattern, stands in _RANDOM:
         name = pattern.sub(stands, name)
     return name
 
 
-def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> list[Call]:
+def parse(
+    text: str, roles: dict[int, str], root: Path, folder: str = "/", which: int = 0
+) -> list[Call]:
     """Return the calls that touch a file below ``root``, in the order in which they ended.
 
-    ``roles`` names threads and processes; any other process is named after its program.
+    ``roles`` names threads and processes; any other process is named after its program. A process
+    that strace does not number has the number 0.
     """
     known, roles = set(roles), dict(roles)
     folders: dict[int, str] = {}
     counts: dict[tuple[int, str], int] = {}
-    first = _LINE.match(text)
-    if first:
-        folders[int(first[1])] = folder
+    if first := _LINE.match(text):
+        folders[int(first[1] or 0)] = folder
     found = []
     for process, line in _whole_lines(text, roles, folders):
         match = _CALL.match(line)
@@ -97,7 +121,8 @@ def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> li
         inside = tuple(path for path in paths if path.startswith(f"{root}/"))
         if inside:
             role = roles.get(process, "?")
-            found.append(Call(process, role, kind, n, arguments, result, inside))
+            file = file_class(inside[-1], root)
+            found.append(Call(role, kind, file, n, arguments, result, inside, which))
     return found
 
 
@@ -107,10 +132,8 @@ def _whole_lines(
     """Yield each call with its process; join the two parts of an interrupted call."""
     begun: dict[int, str] = {}
     for raw in text.splitlines():
-        match = _LINE.match(raw)
-        if match is None:
-            continue
-        process, line = int(match[1]), match[2]
+        number, line = _LINE.fullmatch(raw).groups()
+        process = int(number or 0)
         if process not in folders:
             parents = [p for p, part in begun.items() if part.startswith(_FORKS)]
             folders[process] = folders.get(parents[-1], "/") if parents else "/"

@@ -24,6 +24,8 @@ class Target:
     seeds: tuple[bytes, ...] = ()
     values: st.SearchStrategy[Any] | None = None
     expected: tuple[type[Exception], ...] = (InvalidInput, StateRepoError)
+    names_files: bool = False
+    """Whether each fault must name its file."""
 
     @property
     def name(self) -> str:

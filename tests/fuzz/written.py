@@ -9,15 +9,12 @@ import copy
 import json
 import re
 import subprocess
-import tempfile
 from contextlib import suppress
 from datetime import datetime
-from functools import cache
 from pathlib import PurePosixPath
 from random import Random
 from typing import Any
 
-import pygit2
 import pyjson5
 import yaml
 from demandops.base import strict_yaml
@@ -34,7 +31,8 @@ from demandops.serve import proposal
 from hypothesis import strategies as st
 
 from tests.fuzz import Target
-from tests.kit import forms
+from tests.fuzz.parsers import bare_repo
+from tests.kit import forms, plain_yaml
 from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo
 from tests.kit.plain_yaml import FAST
@@ -53,10 +51,6 @@ _SUBDOMAIN = re.compile(r"[a-z0-9]([-a-z0-9.]{0,251}[a-z0-9])?")
 _LAUNCH = re.compile(r"node_name:=[a-z0-9_]+|__node:=[a-z0-9_]+")
 
 
-def _yaml(text: str) -> Any:
-    return yaml.load(text, Loader=FAST)  # noqa: S506 - derives from SafeLoader
-
-
 # ---- rendered files ----
 
 
@@ -65,17 +59,19 @@ def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
     seed, texts = given
     random, files, goal = Random(seed), forms.rich(), forms.own_goal()
     name = random.choice([path for path in files if path.startswith(("inventory", "registry"))])
-    data = _yaml(files[name])
+    data = plain_yaml.load(files[name])
     renamed = {old: random.choice(texts) for old in ("vehicle00", "edge") if random.random() < 0.3}
-    for holder, key in _strings(data) + _strings(goal):
-        if random.random() < 0.05:
-            holder[key] = random.choice(texts)
+    for document in (data, goal):
+        for *above, key in [*forms.places(document)]:
+            holder = forms.at(document, tuple(above))
+            if isinstance(holder[key], str) and random.random() < 0.05:
+                holder[key] = random.choice(texts)
     files[name] = yaml.safe_dump(data, allow_unicode=True)
     for old, new in renamed.items():  # an id is renamed everywhere
         goal = _renamed(goal, old, new)
         for path in files:
             if path.startswith("inventory/"):
-                whole = _renamed(_yaml(files[path]), old, new)
+                whole = _renamed(plain_yaml.load(files[path]), old, new)
                 files[path] = yaml.safe_dump(whole, allow_unicode=True)
     goal["connections"][0]["type"] = random.choice(["mqtt", "zenoh", "ros"])
     return files, goal
@@ -83,17 +79,6 @@ def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
 
 def _renamed(data: Any, old: str, new: str) -> Any:
     return json.loads(json.dumps(data).replace(json.dumps(old), json.dumps(new)))
-
-
-def _strings(data: Any) -> list[tuple[Any, Any]]:
-    """Return the holder and the key of each text in a document."""
-    found: list[tuple[Any, Any]] = []
-    for key, value in list(data.items() if isinstance(data, dict) else enumerate(data)):
-        if isinstance(value, str):
-            found.append((data, key))
-        elif isinstance(value, dict | list):
-            found += _strings(value)
-    return found
 
 
 def rendered_file(given: tuple[dict[str, str], Any]) -> None:
@@ -120,7 +105,7 @@ def _fits_kubernetes(document: Any) -> None:
         assert _SUBDOMAIN.fullmatch(metadata["name"]), metadata["name"]
     for name, content in (document.get("data") or {}).items():
         if name.endswith((".yaml", ".json5")):
-            assert isinstance(_yaml(content), dict), content
+            assert isinstance(plain_yaml.load(content), dict), content
         if name.endswith(".json5"):
             assert pyjson5.decode(content) == json.loads(content)
     for container in (pod.get("spec") or {}).get("containers") or ():
@@ -149,22 +134,16 @@ def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
     text = override_text("x", wanted)
     data = strict_yaml.load(text)
     assert {key: data[key] for key in wanted} == wanted
-    assert text.startswith("# yaml-language-server: ") and _yaml(text) == data
+    assert text.startswith("# yaml-language-server: ") and plain_yaml.load(text) == data
     Override.from_file("x", parse_file(OverrideFile, text, "overrides/x.yaml"))
 
 
 # ---- Git and forges ----
 
 
-@cache
-def _repo() -> pygit2.Repository:
-    folder = tempfile.mkdtemp(prefix="demandops-fuzz-")
-    return pygit2.init_repository(folder, bare=True, initial_head="main")
-
-
 def author_in_git(words: tuple[str, str, datetime]) -> None:
     name, email, time = words
-    repo, who = _repo(), commit_message.signature(name, email, time)
+    repo, who = bare_repo(), commit_message.signature(name, email, time)
     oid = repo.create_commit(None, who, who, "x", repo.TreeBuilder().write(), [])
     lines = repo[oid].read_raw().split(b"\n\n")[0].split(b"\n")
     assert [line.split(b" ")[0] for line in lines] == [b"tree", b"author", b"committer"]

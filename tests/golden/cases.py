@@ -29,22 +29,11 @@ from tests.kit.memory import MemoryRepo
 
 Files = Mapping[str, str]
 
-GOLDEN = Path(__file__).parents[1] / "golden"
+GOLDEN = Path(__file__).parent
 
 EXPERIMENT = "experiment"
 FOLLOWING = ("argocd-experiment",)
-CASES = (
-    EXPERIMENT,
-    "differing-topic-names",
-    "charts-from-registries",
-    "mqtt-secured",
-    "zenoh",
-    "ros",
-    *FOLLOWING,
-    "argocd-charts-from-registries",
-    "overrides",
-    "scaling",
-)
+CASES = tuple(sorted(path.name for path in GOLDEN.glob("[a-z]*") if path.is_dir()))
 START = "0-start"
 DELETED = "DELETED"
 
@@ -59,7 +48,6 @@ def requests_of(case: str) -> list[Path]:
 
 
 def start(case: str) -> tuple[State, dict[str, str]]:
-    """Return the state before the first request, and the files generated from it."""
     state = MemoryRepo(texts_below(GOLDEN / case / "state-repo")).state
     return state, rendered_files(state)
 
@@ -75,23 +63,17 @@ def play(case: str) -> Iterator[tuple[str, MemoryRepo]]:
 
 @lru_cache
 def rendered(case: str) -> Mapping[str, Files]:
-    """Return all generated files after each step."""
     return {name: dict(repo.files) for name, repo in play(case)}
-
-
-whole = rendered
 
 
 # ---- what is stored ----
 
 
 def read(case: str) -> dict[str, dict[str, str]]:
-    expected = GOLDEN / case / "expected"
     steps: dict[str, dict[str, str]] = {}
-    for path in sorted(expected.rglob("*")):
-        if path.is_file():
-            step, _, name = path.relative_to(expected).as_posix().partition("/")
-            steps.setdefault(step, {})[name] = path.read_text()
+    for path, text in texts_below(GOLDEN / case / "expected").items():
+        step, _, name = path.partition("/")
+        steps.setdefault(step, {})[name] = text
     return steps
 
 
@@ -107,7 +89,6 @@ def to_store(case: str) -> dict[str, dict[str, str]]:
 
 
 def _base(case: str, step: str, before: Files) -> dict[str, str]:
-    """Return the files to which a step's stored change is applied."""
     if case == EXPERIMENT or (step != START and case not in FOLLOWING):
         return dict(before)
     steps: dict[str, Files] = {"": {}, **rendered(EXPERIMENT)}

@@ -1,17 +1,13 @@
 """`demandops upgrade` to another controller, and to a newer program that renders other files.
 
 The newer program is a copy of this one with a higher render version and another time-out in
-HelmReleases. It runs in a process of its own.
+HelmReleases.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +18,7 @@ from demandops.repo import upgrade
 from demandops.repo.git import remote_repository
 
 from tests.integration.conftest import On
-from tests.kit.cli import Dialogue, Ran, Run
+from tests.kit.cli import PROGRAM, Dialogue, Ran, Run, process
 from tests.kit.goals import perception
 from tests.kit.repo import GitRepo
 from tests.kit.rig import book, running
@@ -41,25 +37,9 @@ NEWER = (
 )
 
 
-# This program runs a command for each line of its input, all in one process. A line has the
-# arguments and the standard input of the command.
-SERVE = """
-import io, json, os, sys
-from contextlib import redirect_stderr, redirect_stdout
-from demandops.cli.main import run
-commands, answers = sys.stdin, sys.stdout
-for line in commands:
-    args, text, os.environ["DEMANDOPS_DATA_HOME"] = json.loads(line)
-    sys.stdin = io.TextIOWrapper(io.BytesIO(text.encode()), "utf-8")
-    with redirect_stdout(io.StringIO()) as out, redirect_stderr(io.StringIO()) as err:
-        code = run(args)
-    print(json.dumps([code, out.getvalue(), err.getvalue()]), file=answers, flush=True)
-"""
-
-
 @pytest.fixture(scope="session")
-def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subprocess.Popen[str]]:
-    """A process that runs commands of a program with render version 4 and another time-out."""
+def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a program with render version 4 and another time-out."""
     folder = tmp_path_factory.mktemp("newer")
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
@@ -70,28 +50,18 @@ def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subproce
         text = (folder / path).read_text()
         assert text.count(old) == 1
         (folder / path).write_text(text.replace(old, new))
-    roots = (folder / "generator", folder / "ros_bridge")
-    with subprocess.Popen(
-        [sys.executable, "-c", SERVE],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, roots))},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        yield process
+    return folder
 
 
 @pytest.fixture
-def newer(newer_program: subprocess.Popen[str], state: GitRepo, data_home: Path) -> Run:
+def newer(newer_program: Path, state: GitRepo) -> Run:
     """Return a function that runs a command of the newer program on the state repo."""
+    roots = os.pathsep.join(str(newer_program / part) for part in ("generator", "ros_bridge"))
 
     def call(*args: str, stdin: str = "") -> Ran:
-        assert newer_program.stdin and newer_program.stdout
-        options = ["--state-repo", str(state.path)]
-        given = json.dumps([[*args, *options], stdin, str(data_home)])
-        print(given, file=newer_program.stdin, flush=True)
-        return Ran(*json.loads(newer_program.stdout.readline()))
+        command = (*PROGRAM, *args, "--state-repo", state.path)
+        environment = os.environ | {"PYTHONPATH": roots}
+        return process(*command, input=stdin, cwd=newer_program, env=environment)
 
     return call
 

@@ -101,7 +101,7 @@ class Mutation(NamedTuple):
     value: Any
     new_place: Place
 
-    def is_at(self, field: str) -> bool:
+    def isat(self, field: str) -> bool:
         """Return whether a fault names the mistake's place, or a place inside or around it."""
         return any(_overlaps(field, path(place)) for place in (self.place, self.new_place))
 
@@ -127,7 +127,7 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
 def _mutations(document: Any, limits: Iterable[int]) -> Iterator[Mutation]:
     """Yield mutations at each place; what is tried changes from place to place."""
     for turn, place in enumerate(places(document)):
-        value = _at(document, place)
+        value = at(document, place)
         wrong = {kind: new for kind, new in _WRONG_TYPES.items() if kind != _SAME.get(type(value))}
         if not isinstance(value, str):
             wrong["text"] = "x"
@@ -141,7 +141,7 @@ def _mutations(document: Any, limits: Iterable[int]) -> Iterator[Mutation]:
         for kind, new in (wrong | _OF_TYPE[type(value)]).items():
             if new != value or type(new) is not type(value):
                 yield Mutation(place, kind, _replaced(document, place, new), value, place)
-        holder = copy.copy(_at(document, place[:-1]))
+        holder = copy.copy(at(document, place[:-1]))
         del holder[place[-1]]
         yield Mutation(place, "removed", _replaced(document, place[:-1], holder), value, place)
         if isinstance(value, dict):
@@ -149,7 +149,7 @@ def _mutations(document: Any, limits: Iterable[int]) -> Iterator[Mutation]:
             added = (*place, "zz")
             yield Mutation(added, "added", _replaced(document, place, more), None, added)
         if isinstance(place[-1], str):
-            holder, key = _at(document, place[:-1]), place[-1]
+            holder, key = at(document, place[:-1]), place[-1]
             own = re.sub("[A-Z]", lambda capital: f"_{capital[0].lower()}", key)
             for kind, name in (("misspelt", "Zz?"), ("the program's own name", own)):
                 if name != key:
@@ -175,7 +175,7 @@ def places(document: Any, place: Place = ()) -> Iterator[Place]:
         yield from places(value, (*place, key))
 
 
-def _at(document: Any, place: Place) -> Any:
+def at(document: Any, place: Place) -> Any:
     for key in place:
         document = document[key]
     return document
@@ -213,7 +213,7 @@ def problem(
     - A fault at another place must quote one of the mutation's :meth:`~Mutation.names`.
     """
     place = path(mutation.place)
-    here = [found for found in faults if found.file == file and mutation.is_at(found.field)]
+    here = [found for found in faults if found.file == file and mutation.isat(found.field)]
     control = mutation.kind in ("reversed text", "a bell")
     in_free = any(path(mutation.place[:end]) in free for end in range(1, len(mutation.place) + 1))
     if not here and (form.forbids(mutation.document) or (control and not in_free)):

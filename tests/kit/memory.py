@@ -12,13 +12,14 @@ from typing import Any
 
 import jsonschema_rs
 import yaml
-from demandops.base.errors import Refused
+from demandops.base.errors import Fault, Refused
 from demandops.base.settings import data_folder
 from demandops.decide.bookkeeping import as_data, bookkeeping
 from demandops.decide.decision import Decision, decide
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import Config
 from demandops.model.config.load import load
+from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
@@ -87,7 +88,11 @@ class MemoryRepo:
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
         if isinstance(goal, dict) and goal.get("kind") == "Decommission":
             goal = read_journaled(goal)
-        return decide(self.state, goal, now or self.now, self.files.get)
+        return decide(self.state, goal, now or self.now, self.files.get, throttle=self.throttle)
+
+    def throttle(self, request: Demand, config: Config) -> Iterable[Fault]:
+        """Limit no rates; a subclass may."""
+        return ()
 
     def send(self, goal: object, now: datetime | None = None) -> Decision:
         decision = self.decide(goal, now)

@@ -85,7 +85,6 @@ class Books:
         return "released" if gives_up else "booked"
 
     def of(self, demand: str) -> dict[Subject, Claim]:
-        """Return the claims of a ``Demand``."""
         return {key[0]: claim for key, claim in self.claims.items() if key[1] == (demand, ())}
 
     def on(self, kind: str) -> list[tuple[str, Claim]]:
@@ -206,7 +205,13 @@ class Books:
             if subject[0] == "application":
                 topics = listed.topics or claim.topics
                 if key[0] == subject and listed.means(claim):
-                    yield from ((topic, key, topic) for topic in topics if topic in claim.topics)
+                    # a shutdown may leave out a topic's source too
+                    pairs = ((one, own) for one in topics for own in claim.topics)
+                    yield from (
+                        (one, key, own)
+                        for one, own in pairs
+                        if one[:2] == own[:2] and one[2] in ("", own[2])
+                    )
                 continue
             if not listed.means(claim):
                 continue

@@ -7,7 +7,7 @@ requests often concern the same ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from random import Random
@@ -89,18 +89,23 @@ OWN = Words(
     connections={id: CONNECTIONS[id] for id in ("station00/edge", "vehicle00/edge")},
 )
 
-_JOINED_CONNECTION = {
-    "broker_node_id": (12, ("", "cloud", "edge", "vehicle00")),
-    "target_node_id": (24, ("cloud", "edge", "vehicle03", "nowhere")),
-    "source_node_id": (24, ("vehicle02", "neverland")),
-    "type": (40, (0, 2, 7)),
+_ODD: dict[str, Sequence[Any]] = {
+    "node_id": ("", "cloud", "edge", "nowhere"),
+    "source_node_id": ("", "vehicle02", "vehicle03", "neverland"),
+    "target_node_id": ("", "cloud", "edge", "vehicle03", "nowhere"),
+    "broker_node_id": ("", "cloud", "edge", "vehicle00", "nowhere"),
+    "type": (0, 2, 7),
+    "topic_name": (lambda name: name.lstrip("/"),),
+    "requester_ids": (lambda who: [],),
+    "ego_data_topics": (lambda topics: topics[:1], lambda topics: []),
+    "pointcloud_topics": (
+        lambda topics: topics[:1],
+        lambda topics: [],
+        lambda topics: [*topics, input_topic(REAR)],
+    ),
+    "target_topics": (lambda topics: ["/elsewhere", *topics[1:]], lambda topics: topics[1:]),
 }
-_LEFT_CONNECTION = {
-    "target_node_id": (10, ("", "cloud", "vehicle03", "nowhere")),
-    "source_node_id": (10, ("", "vehicle02", "neverland")),
-    "broker_node_id": (10, ("", "cloud", "nowhere")),
-    "type": (10, (0, 2, 7)),
-}
+"""What a goal may have in a field by mistake: values, and functions of the right value."""
 
 
 def shutdown_of(joined: Goal) -> Goal:
@@ -182,10 +187,13 @@ class Maker:
             made["id"] = self._pick(REQUESTS)
         if self._odds(4):
             self._ask_others(made)
-        for app in made["apps"]:
-            self._leave_application(app)
         for item in made["connections"]:
-            self._leave_connection(item)
+            keep = self._random.randrange(2) if self._odds(4) else None
+            more = ["/never/asked"] * self._odds(10)
+            for field in ("source_topics", "target_topics"):
+                item[field] = item[field][:keep] + more
+        for item in (*made["apps"], *made["connections"]):
+            self._change(item, 16)
         if self.joined and self._odds(8):
             more = self._pick(self.joined)
             made["apps"] += deepcopy(more["apps"])
@@ -224,26 +232,11 @@ class Maker:
         return [first, STATION if first != STATION else self._pick(VEHICLES)]
 
     def _disturb(self, made: Goal) -> None:
-        for app in made["apps"]:
-            body = app["object_detection_fusion_app"]
-            self._change(app["header"], {"node_id": (16, ("cloud", "edge", "nowhere"))})
-            self._change(body, {"requester_ids": (40, ([],))})
-            self._change(app, {"type": (40, (2,))})
-            if self._odds(40):
-                body["ego_data_topics"], body["pointcloud_topics"] = [], []
-            for topic in (*body["ego_data_topics"], *body["pointcloud_topics"]):
-                if self._odds(15):
-                    topic["topic_name"] = topic["topic_name"].lstrip("/")
-                self._change(topic, {"source_node_id": (60, ("vehicle03", "nowhere"))})
         for item in made["connections"]:
-            self._change(item, _JOINED_CONNECTION)
-            if self._odds(20):
-                item["target_topics"][0] = "/elsewhere"
-            self._change(item, {"requester_ids": (48, ([],))})
-            if self._odds(40):
-                item["target_topics"] = item["target_topics"][1:]
             if self._odds(40):
                 item["source_topics"], item["target_topics"] = [], []
+        for item in (*made["apps"], *made["connections"]):
+            self._change(item, 30)
         if self._odds(16):  # all applications or all connections get other requesters
             self._name(self._pick(["apps", "connections"]), made, self._people())
         for kind in ("apps", "connections"):
@@ -264,35 +257,15 @@ class Maker:
         for item in made[kind]:
             item.get("object_detection_fusion_app", item)["requester_ids"] = list(who)
 
-    def _leave_application(self, app: Item) -> None:
-        body = app["object_detection_fusion_app"]
-        for field in ("ego_data_topics", "pointcloud_topics"):
-            if self._odds(4):
-                body[field] = body[field][:1]
-            elif self._odds(4):
-                body[field] = []
-        if self._odds(8):
-            body["pointcloud_topics"] += [input_topic(self._pick(CLOUDS))]
-        self._change(app["header"], {"node_id": (10, ("", "cloud", "edge", "nowhere"))})
-        self._change(app, {"type": (20, (0, 2))})
-
-    def _leave_connection(self, item: Item) -> None:
-        if self._odds(4):
-            keep = self._random.randrange(2)
-            item["source_topics"] = item["source_topics"][:keep]
-            item["target_topics"] = item["target_topics"][:keep]
-        self._change(item, _LEFT_CONNECTION)
-        if self._odds(10) and item["target_topics"]:
-            item["target_topics"][0] = "/elsewhere"
-        if self._odds(10):
-            item["source_topics"] = [*item["source_topics"], "/never/asked"]
-            item["target_topics"] = [*item["target_topics"], "/never/asked"]
-
-    def _change(self, item: Item, changes: Mapping[str, tuple[int, Sequence[Any]]]) -> None:
-        """Change each field once in so many times to one of the given values."""
-        for field, (against, values) in changes.items():
-            if self._odds(against):
-                item[field] = self._pick(values)
+    def _change(self, item: Item, against: int) -> None:
+        """Put something odd in fields of an item, in each once in so many times."""
+        for field, value in item.items():
+            for part in value if isinstance(value, list) else [value]:
+                if isinstance(part, dict):
+                    self._change(part, against)
+            if field in _ODD and self._odds(against):
+                odd = self._pick(_ODD[field])
+                item[field] = odd(value) if callable(odd) else odd
 
     # Chance
 
@@ -370,9 +343,4 @@ class DemandMaker:
 
 
 def ended(put: Goal, operation: str) -> Goal:
-    """Return the release or renewal of a demand by its requesters."""
     return {name: put[name] for name in ("kind", "demand", "requesters")} | {"operation": operation}
-
-
-def summary(made: Goal) -> dict[str, Any]:
-    return {key: value for key, value in made.items() if value not in ([], False)}

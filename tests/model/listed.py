@@ -9,8 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-Goal = dict[str, Any]
-Item = dict[str, Any]
+from tests.kit.goals import Goal, Item
 
 Subject = tuple[str, str]
 """A subject: its kind (``application`` or ``connection``) and its id."""
@@ -82,13 +81,11 @@ class Claim:
         return all(value in ("", claim.fixed[name]) for name, value in self.fixed.items())
 
     def routes(self) -> dict[Route, Topic]:
-        """Return the topics of a connection by what they are at both ends."""
         ends = self.fixed.get("source", ""), self.fixed.get("target", "")
         return {(ends[0], one[0], ends[1], to): one for one, to in self.topics.items()}
 
 
 def absolute(topic: str) -> str:
-    """Return the absolute name of a topic, as ROS resolves it in the root namespace."""
     return topic if topic.startswith("/") else f"/{topic}"
 
 

@@ -1,8 +1,9 @@
-"""A model of what runs: the services of applications, the routes of connections, and overrides.
+"""A model of what runs: services, replicas, separate instances, connections and overrides.
 
-It is written from what docs/connections.md, docs/appdef.md and docs/overrides.md promise, and
-imports nothing of the program. In this model, each application of the type ``FUSION`` runs one
-service, and each connection has a client at both ends.
+It is written from what docs/connections.md, docs/appdef.md, docs/versions.md, docs/policy.md and
+docs/overrides.md promise, and imports nothing of the program. In this model, each application of
+the type ``FUSION`` runs one service, each demand for an instance has one application, and each
+connection has a client at both ends.
 """
 
 from __future__ import annotations
@@ -14,8 +15,25 @@ from datetime import datetime
 from typing import Any
 
 from tests.model.books import Refused
-from tests.model.instances import FURTHER, TALLY, Instances
 from tests.model.listed import FUSION, Goal
+from tests.model.places import Places
+
+TALLY = "tally"
+"""The type with separate instances, which need a replica per topic, and ``MOST`` at most."""
+DEFAULT, NEXT = "1.0.0", "1.1.0"
+HALL, FIRST, FURTHER = "hall", "hall@perception", "hall@city"
+"""A node in two access domains, its name in the first one, and its name in the further one."""
+MAY = {
+    "vehicle00": frozenset({HALL}),
+    "vehicle01": frozenset({HALL, FURTHER}),
+    "traffic": frozenset({FURTHER}),
+}
+"""For each requester, the names under which it may demand the node ``hall``."""
+MOST = 3
+
+Instance = tuple[str, str]
+"""An application's id, and its node."""
+
 
 Service = tuple[str, str]
 """An application's id, and its node."""
@@ -50,17 +68,21 @@ class Override:
 
 
 @dataclass
-class Running(Instances):
-    """Adds what runs, and the overrides in effect."""
+class Running(Places):
+    """Adds separate instances, what runs, and the overrides in effect."""
 
+    testing: str = NEXT
     overrides: frozenset[Override] = frozenset()
 
     def _taken(self, goal: Goal, now: float, received: str) -> str:
         """Refuse also what is new for a denied connection, or beyond ``CITY_QUOTA``."""
+        app: dict[str, Any] = next(iter(goal.get("applications", [])), {})
+        tallies = app.get("type") == TALLY
+        if tallies:
+            goal = goal | {"applications": [self._chosen(app, goal["requesters"])]}
         denied = {one["id"] for one in goal.get("connections", ())} & self.denied()
         had, counts = self._holds(denied), self._claims_in_city()
         outcome = super()._taken(goal, now, received)
-        tallies = any(one.get("type") == TALLY for one in goal.get("applications", ()))
         for name, count in self._claims_in_city().items() if tallies else ():
             if count > max(CITY_QUOTA, counts[name]):
                 raise Refused("the quota of the domain is used up")
@@ -102,3 +124,35 @@ class Running(Instances):
                 carried = {topic: target for (topic,), target in claim.topics.items()}
                 routes.setdefault(link, {}).update(carried)
         return routes
+
+    def _chosen(self, app: dict[str, Any], who: list[str]) -> dict[str, Any]:
+        asked = app["version"]
+        version = self.testing if asked == "testing" else asked or DEFAULT
+        asked = asked and version  # a claim records the version, not the channel
+        id = app["id"].removesuffix(f"@{NEXT}")
+        if version == NEXT:
+            id = f"{id}@{NEXT}"
+        elif app["id"] != id:
+            raise Refused("the id is that of another version")
+        node = HALL if app["node"] == FIRST else app["node"]
+        if app["node"] == HALL:
+            booked = {on for other, on in self.demanded() if other == id}
+            allowed = {one for one in (HALL, FURTHER) if all(one in MAY[name] for name in who)}
+            if len(choice := booked or allowed) != 1:
+                raise Refused("the domain is not clear")
+            (node,) = choice
+        if any(node not in MAY[name] for name in who):
+            raise Refused("it may not demand the node")
+        return app | {"id": id, "node": node, "version": asked}
+
+    def demanded(self) -> dict[Instance, frozenset[str]]:
+        found: dict[Instance, frozenset[str]] = {}
+        for id, claim in self.on("application"):
+            if claim.fixed["type"] == TALLY:
+                one = id, claim.fixed["node"]
+                topics = (topic for _, topic, _ in claim.topics)
+                found[one] = found.get(one, frozenset()).union(topics)
+        return found
+
+    def replicas(self, one: Instance) -> int:
+        return min(MOST, len(self.demanded()[one]))

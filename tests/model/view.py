@@ -96,7 +96,6 @@ def _connections(books: Books) -> dict[str, dict[str, Any]]:
 
 
 def _sorted(value: Any) -> Any:
-    """Return plain data in which sets have become sorted lists."""
     if isinstance(value, dict):
         return {key: _sorted(inner) for key, inner in value.items()}
     return sorted(value) if isinstance(value, set) else value

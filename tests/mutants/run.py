@@ -105,10 +105,8 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def import_mutated(mutant: Mutant) -> None:
-    original, code = (
-        SourceFileLoader.get_code,
-        compile(mutant.tree(), mutant.path, "exec", dont_inherit=True),
-    )
+    original = SourceFileLoader.get_code
+    code = compile(mutant.tree(), mutant.path, "exec", dont_inherit=True)
 
     def get_code(loader: SourceFileLoader, name: str) -> CodeType | None:
         return code if loader.path == str(mutant.path) else original(loader, name)

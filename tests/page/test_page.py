@@ -139,16 +139,6 @@ BROKEN_WORDS = r"""
 """
 
 
-def test_the_first_view_tells_why_since_when_and_who(visit: Visits) -> None:
-    page = visit().open("/?q=vehicle00")
-    cause = page.locator(".cause").first
-    expect(cause).to_contain_text("object-detection on edge for vehicle00 fails")
-    expect(cause).to_contain_text("manifest unknown")
-    expect(cause.locator("time")).to_have_text(re.compile(r"^1\dm ago$"))
-    expect(cause.locator("dd").first).to_contain_text("object-detection:2025-04: push the image")
-    expect(cause).to_contain_text("edge/object_detection_fusion")
-
-
 def test_an_update_of_the_page_keeps_the_focus_and_the_typed_text(
     visit: Visits, fleet: Story
 ) -> None:

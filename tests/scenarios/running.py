@@ -16,14 +16,19 @@ import yaml
 from demandops.base.errors import Fault, Refused
 from demandops.decide.booking import Drain, Restoration
 from demandops.decide.checks.forbidden import whole_usage
-from demandops.decide.decision import Decision, decide
+from demandops.decide.decision import Decision
 from demandops.decide.edits import changed_claim_files
 from demandops.decide.placement.relocation import following_overrides
 from demandops.decide.state import State, rendered_files
-from demandops.model.config.base_model import FrozenModel, parse_file, seconds_of
+from demandops.model.config.base_model import (
+    FrozenModel,
+    duration_text,
+    parse_file,
+    seconds_of,
+)
+from demandops.model.config.config import Config
 from demandops.model.config.load import load
 from demandops.model.demand.demand import Demand
-from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import in_turn
 from demandops.serve.agenda import Agenda, RateLimit
@@ -40,7 +45,7 @@ HERE = Path(__file__).parent
 _APPDEFS = HERE.parent / "appdefs"
 
 
-# # ---- the form of a scenario ----
+# ---- the form of a scenario ----
 
 
 class ExpectedFault(FrozenModel):
@@ -52,12 +57,6 @@ class ExpectedFault(FrozenModel):
     def fits(self, found: Fault) -> bool:
         words = all(word in found.message for word in self.says)
         return (self.code, self.file, self.field) == (found.code, found.file, found.field) and words
-
-
-_CHECKS = (
-    "gives", "refused", "expires", "runs", "connections", "carries", "desired", "leases", "holds",
-    "warns", "waiting", "asks", "places", "nodes", "effects",
-)  # fmt: skip
 
 
 class Step(FrozenModel):
@@ -95,8 +94,10 @@ class Step(FrozenModel):
 
     @model_validator(mode="after")
     def _checkable(self) -> Step:
-        if all(getattr(self, name) is None for name in _CHECKS):
-            raise ValueError(f"checks nothing; add at least one of {', '.join(_CHECKS)}")
+        optional = {name for name, each in type(self).model_fields.items() if each.default is None}
+        checks = sorted(optional - {"send", "back_to"})
+        if all(getattr(self, name) is None for name in checks):
+            raise ValueError(f"checks nothing; add at least one of {', '.join(checks)}")
         if self.refused is not None and not self.refused:
             raise ValueError("refused is empty; list the faults that the refusal must have")
         if self.holds is not None and not (self.holds and all(self.holds.values())):
@@ -171,10 +172,9 @@ def configuration(
 class World(MemoryRepo):
     def __init__(self, state: State, config: Mapping[str, str]) -> None:
         super().__init__(state=state)
-        self.clock = Clock(START)
+        self.clock, self._sent = Clock(START), 0
         self.configure(state, config)
         self.ledgers = [state.ledger]  # after each step
-        self._sent = 0
         self.restart()
 
     def configure(self, state: State, config: Mapping[str, str]) -> None:
@@ -196,16 +196,11 @@ class World(MemoryRepo):
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
         self._sent += 1
-        if isinstance(goal, dict) and goal.get("kind") == "Decommission":
-            goal = read_journaled(goal)
-        operation, now = f"hand-in-{self._sent}", now or self.clock.now()
-        return decide(
-            self.state,
-            goal,
-            now,
-            self.files.get,
-            throttle=lambda request, config: self._throttle.faults(request, config, operation, now),
-        )
+        return super().decide(goal, self.clock.now())
+
+    def throttle(self, request: Demand, config: Config) -> Iterable[Fault]:
+        operation = f"hand-in-{self._sent}"
+        return self._throttle.faults(request, config, operation, self.clock.now())
 
     def do_what_is_due(self) -> list[str]:
         """Do what the generator does by itself; return the demands whose leases ended, in order."""
@@ -226,32 +221,26 @@ class World(MemoryRepo):
             taken = self.take(waiting.put)
             assert isinstance(taken, Decision), taken
 
-    def waiting(self) -> list[str]:
-        return [one.demand for one in in_turn(self.state.ledger.waiting)]
+    def compared(self) -> dict[str, Any]:
+        """Return what steps may expect of the state.
 
-    def runs(self) -> dict[str, list[str]]:
-        """Map each service, such as `driver for vehicle00 /points on edge`, to its requesters."""
+        ``runs`` has services like `driver for vehicle00 /points on edge`, ``nodes`` what is
+        requested of each node that has a capacity, such as `1 of 3`.
+        """
+        books = self.bookkeeping()
+        services, links = books["services"].values(), books["connections"].items()
+        leased = sorted((one.lease.until, one.demand) for one in self.state.ledger if one.lease)
         return {
-            f"{entry['service']} for {_purpose(entry)} on {entry['node']}": entry["requesters"]
-            for entry in self.books()["services"].values()
-        }
-
-    def connections(self, what: str) -> dict[str, list[str]]:
-        return {id: [*entry[what]] for id, entry in self.books()["connections"].items()}
-
-    def nodes(self) -> dict[str, dict[str, str]]:
-        """Return what is requested of each node that has a capacity, such as `1 of 3`."""
-        return {
-            id: {name: f"{one['requested']} of {one['capacity']}" for name, one in entry.items()}
-            for id, entry in self.bookkeeping().get("nodes", {}).items()
-        }
-
-    def leases(self) -> dict[str, datetime]:
-        """Return, for each demand, the latest of its leases' recorded ends."""
-        leased = sorted(
-            (claim.lease.until, claim.demand) for claim in self.state.ledger if claim.lease
-        )
-        return {demand: until for until, demand in leased}
+            "runs": {f"{each['service']} for {_purpose(each)} on {each['node']}": each["requesters"]
+                for each in services},
+            "nodes": {id: {name: f"{one['requested']} of {one['capacity']}"
+                for name, one in entry.items()} for id, entry in books.get("nodes", {}).items()},
+            "waiting": [one.demand for one in in_turn(self.state.ledger.waiting)],
+            "connections": {id: [*entry["requesters"]] for id, entry in links},
+            "carries": {id: [*entry["topics"]] for id, entry in links},
+            "leases": {demand: duration_text((until - START).total_seconds())
+                for until, demand in leased},
+        }  # fmt: skip
 
     def assert_sound(self) -> None:
         """Check that the files are exactly those of the ledger and of the ledger's releases."""
@@ -309,17 +298,9 @@ def _take(step: Step, world: World, place: str) -> None:
             raise AssertionError(f"{place}: {problem}")
         if isinstance(taken, Decision) and taken.awaited:
             world.book_waiting()
-    compared = {
-        "runs": world.runs,
-        "nodes": world.nodes,
-        "waiting": world.waiting,
-        "connections": lambda: world.connections("requesters"),
-        "carries": lambda: world.connections("topics"),
-        "leases": lambda: {d: _since_start(end) for d, end in sorted(world.leases().items())},
-    }
-    for name, found in compared.items():
+    for name, found in world.compared().items():
         wanted = getattr(step, name)
-        assert wanted is None or found() == wanted, f"{place}: {name}"
+        assert wanted is None or found == wanted, f"{place}: {name}"
     for name, words in (step.holds or {}).items():
         texts = [t for path, t in world.rendered().items() if Path(path).name.startswith(name)]
         assert len(texts) == 1, f"{place}: {len(texts)} releases are called {name}…"
@@ -367,12 +348,3 @@ def same_faults(wanted: Iterable[ExpectedFault], found: Iterable[Fault]) -> bool
             return False
         left.remove(fitting)
     return not left
-
-
-def _since_start(moment: datetime) -> str:
-    """Return the duration from the scenario's start to ``moment``, like ``1h30m``."""
-    rest, text = int((moment - START).total_seconds()), ""
-    for unit, seconds in (("h", 3600), ("m", 60), ("s", 1)):
-        count, rest = divmod(rest, seconds)
-        text += f"{count}{unit}" if count else ""
-    return text or "0s"

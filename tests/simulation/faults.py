@@ -1,13 +1,13 @@
 """Faults that tests plant in the program, one at a time; the oracle must find each.
 
 Each is what a wrong line could do, in the room that the heading names. If its code goes, plant
-another of its kind. :data:`FAULTS` lists them all.
+another of its kind.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from inspect import getattr_static
 from typing import Any
@@ -46,38 +46,25 @@ Wrong = Callable[..., Any]
 
 @dataclass
 class Fault:
-    """Wrong code in some places; ``seed`` found it at once when it was written."""
+    """Wrong code in a module or class, or in two; ``seed`` found it at once when it was written."""
 
     seed: int
-    parts: list[tuple[Any, str, Wrong]] = field(default_factory=list)
+    owner: Any
+    name: str
+    wrong: Wrong
+    second: tuple[Any, str, Wrong] | None = None
 
     def plant(self, patch: Callable[[Any, str, Any], None]) -> None:
-        for owner, name, wrong in self.parts:
-            patch(owner, name, _instead_of(getattr_static(owner, name), wrong))
+        for part in ((self.owner, self.name, self.wrong), self.second):
+            if part:
+                owner, name, wrong = part
+                patch(owner, name, _instead_of(getattr_static(owner, name), wrong))
 
 
 def _instead_of(right: Any, wrong: Wrong) -> Any:
     if isinstance(right, property):
         return property(lambda one: wrong(right.fget, one))
     return lambda *given, **named: wrong(right, *given, **named)
-
-
-FAULTS: dict[str, Fault] = {}
-
-
-def plant(title: str, seed: int, owner: Any, name: str, wrong: Wrong) -> None:
-    """Add a fault, or a part of one; ``name`` is what is wrong in a module or class."""
-    FAULTS.setdefault(title, Fault(seed)).parts.append((owner, name, wrong))
-
-
-def wrong(seed: int, owner: Any, name: str) -> Callable[[Wrong], Wrong]:
-    """Add the decorated function as a fault, or as a part of one."""
-
-    def add(made: Wrong) -> Wrong:
-        plant(made.__name__, seed, owner, name, made)
-        return made
-
-    return add
 
 
 def nothing(*_: Any, **more: Any) -> None:
@@ -92,30 +79,24 @@ def first_only(right: Wrong, *given: Any) -> Any:
     return [*right(*given)][:1]
 
 
-def in_reverse(right: Wrong, *given: Any) -> Any:
-    return right(*given)[::-1]
+def with_(made: Any, **changed: Any) -> Any:
+    """Change attributes of an object, even of a frozen one, and return the object."""
+    for name, value in changed.items():
+        object.__setattr__(made, name, value)
+    return made
 
 
-# ---- booking ----
+def answered_first(kind: type) -> Wrong:
+    """Return a ``Worker._publish_commits`` that first gives the answers of a kind."""
+
+    def publish(right: Wrong, worker: Any, commits: Any, results: Any = (), *more: Any) -> Any:
+        worker._demands.answer([pair for pair in results if isinstance(pair[1], kind)])
+        return right(worker, commits, results, *more)
+
+    return publish
 
 
-plant("let_strangers_change_a_demand", 3, permission, "stranger_faults", lambda *_: ())
-plant("release_only_the_first_claim", 161, booking, "claims_of", first_only)
-plant("replace_what_was_joined", 2, Application, "extended", lambda _, app, more: more)
-plant("replace_what_was_joined", 2, Connection, "extended", lambda _, connection, more: more)
-plant("grant_one_claim_too_many", 4, forbidden, "_held", lambda held, *given: held(*given) - 1)
-
-
-@wrong(6, booking, "book")
-def commit_what_is_booked_already(
-    book: Any, ledger: Any, item: Any, request: Any, key: Any, current: Any, now: Any, **more: Any
-) -> Any:
-    made = book(ledger, item, request, key, current, now, **more)
-    return made.replace(key, replace(made.get(key), booked=now))
-
-
-@wrong(6, booking, "shut_down")
-def let_a_shutdown_end_any_join_of_its_request(shut_down: Any, ledger: Any, asked: Any) -> Any:
+def ending_any_join(shut_down: Wrong, ledger: Any, asked: Any) -> Any:
     """Find a claim by the request id and one of the requesters."""
     made = []
     for item in asked.demanded:
@@ -125,221 +106,7 @@ def let_a_shutdown_end_any_join_of_its_request(shut_down: Any, ledger: Any, aske
     return shut_down(ledger, replace(asked, demanded=tuple(made)))
 
 
-@wrong(3, permission, "stranger_faults")
-def take_one_common_requester_for_the_owner(
-    faults: Any, request: Any, owners: Any, *more: Any
-) -> Any:
-    owners = {*owners}
-    return () if owners & {*request.requesters()} else faults(request, owners, *more)
-
-
-@wrong(2, Claim, "without_topics")
-def end_the_whole_claim_by_a_shutdown_of_some_topics(_: Any, claim: Any, gone: Any) -> None:
-    return None
-
-
-@wrong(1, Lease, "started")
-def take_back_promised_leases(started: Any, lease: Any, now: Any, before: Any = None) -> Any:
-    return started(lease, now)
-
-
-@wrong(7, Lease, "started")
-def lose_renewals(started: Any, lease: Any, now: Any, before: Any = None) -> Any:
-    return before or started(lease, now)
-
-
-plant("end_leases_by_the_wall_clock", 3, Agenda, "_has_grace", lambda *_: False)
-
-
-plant("never_scale", 1, planner, "_replicas_of", lambda _, scaling, *more: scaling.min)
-
-
-@wrong(3, planner, "_replicas_of")
-def exceed_the_most_replicas(_: Any, scaling: Any, parameters: Any, topics: Any, *more: Any) -> int:
-    return len(topics) or 1
-
-
-@wrong(15, planner, "_replicas_of")
-def count_sources_for_topics(
-    right: Any, scaling: Any, parameters: Any, topics: Any, *more: Any
-) -> Any:
-    return right(scaling, parameters, {topic.source: topic for topic in topics}.values(), *more)
-
-
-plant("share_one_instance", 3, completing, "_separated", itself)
-
-
-@wrong(3, completing, "_separated")
-def move_instances_with_the_channel(separated: Any, app: Any, config: Any) -> Any:
-    return replace(separated(app, config), version=app.version)
-
-
-@wrong(55, completing, "_separated")
-def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: Any) -> Any:
-    made = separated(app, config)
-    return made if made.separate else app
-
-
-plant("take_the_first_domain", 3, Config, "nodes_of", lambda _, config, node: (node,))
-
-
-@wrong(1, completing, "_chosen")
-def forget_what_is_booked_in_a_domain(chosen: Any, one: Any, booked: Any, *more: Any) -> Any:
-    return chosen(one, {}, *more)
-
-
-# ---- routes ----
-
-
-@wrong(0, planner, "connection_topics")
-def carry_only_the_first_demands_routes(topics: Any, claims: Any) -> Any:
-    return topics([*claims][:1])
-
-
-@wrong(0, connection, "merged_routes")
-def name_a_shared_route_twice(_: Any, routes: Any) -> Any:
-    return tuple(sorted(routes, key=lambda one: one.source))
-
-
-plant("deliver_under_the_source_topic", 4, Route, "written_topic", lambda _, one: one.source)
-
-
-@wrong(4, booking, "conflicts")
-def send_a_source_topic_to_two_targets(conflicts: Any, *given: Any, **more: Any) -> Any:
-    return [each for each in conflicts(*given, **more) if ".topics[" not in each.field]
-
-
-@wrong(1, decision, "affected_keys")
-def leave_the_clients_of_a_released_connection(
-    affected: Any, before: Any, after: Any, changes: Any
-) -> Any:
-    left = [one for one in changes if one.after or one.before.is_on_application]
-    return affected(before, after, left)
-
-
-plant("leave_the_far_end", 0, ConnectionType, "keys", first_only)
-
-
-# ---- placement ----
-
-plant("let_the_last_in_first", 9, agenda, "in_turn", in_reverse)
-plant("ignore_priorities", 187, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
-
-
-@wrong(3, decision, "_wait")
-def begin_the_wait_anew(
-    wait: Any, state: Any, demand: Any, reasons: Any, now: Any, *more: Any
-) -> Any:
-    request = wait(state, demand, reasons, now, *more)
-    return request and replace(request, waiting=replace(request.waiting, since=now))
-
-
-plant("forget_those_that_wait", 7, Agenda, "may_have_room", nothing)
-plant("let_others_overtake_in_a_batch", 13, Agenda, "book_those_let_in", nothing)
-plant("leave_drained_nodes_full", 3, agenda, "_to_drain", lambda *_: [])
-plant("place_on_drained_nodes", 1, Choice, "_closed", lambda *_: "")
-plant("choose_anew_for_a_placed_demand", 14, placement, "_booked", nothing)
-plant("count_no_room", 7, forbidden, "excesses", lambda *_: [])
-
-
-@wrong(0, Usage, "plus")
-def count_released_room_as_taken(plus: Any, usage: Any, more: Any) -> Any:
-    return plus(usage, {need: n for need, n in more.items() if n > 0})
-
-
-# ---- overrides ----
-
-
-@wrong(29, decision, "plan_change")
-def apply_no_override_to_what_a_demand_changes(
-    plan: Any, before: Any, after: Any, *more: Any
-) -> Any:
-    object.__setattr__(after, "overrides", ())
-    return plan(before, after, *more)
-
-
-@wrong(0, snapshot, "render_all")
-def apply_overrides_only_to_new_demands(_: Any, tree: Any, state: Any, more: Any = None) -> Any:
-    return Changeset({**(more or {})}, ())
-
-
-@wrong(151, World, "__post_init__")
-def let_the_lowest_priority_win(right: Any, world: Any) -> None:
-    right(world)
-    object.__setattr__(world, "overrides", world.overrides[::-1])
-
-
-@wrong(20, overrides, "fits")
-def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bool:
-    return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
-
-
-plant("run_what_is_denied", 29, planner, "without_suspended", itself)
-plant("book_what_is_denied", 3, forbidden, "denial_faults", lambda *_: ())
-
-
-@wrong(3, edits, "expired_overrides")
-def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
-    return expired(one, now + timedelta(minutes=2))
-
-
-@wrong(3, agenda, "_ends")
-def end_overrides_early_one_by_one(ends: Any, state: Any) -> Any:
-    return [(end - timedelta(minutes=2), name) for end, name in ends(state)]
-
-
-# ---- publishing ----
-
-
-@wrong(0, Worker, "_publish_commits")
-def acknowledge_before_publishing(
-    publish: Any, worker: Any, commits: Any, results: Any = (), *more: Any
-) -> bool:
-    worker._demands.answer([pair for pair in results if isinstance(pair[1], Receipt)])
-    return publish(worker, commits, results, *more)
-
-
-@wrong(4, Worker, "_publish_commits")
-def refuse_before_publishing(
-    publish: Any, worker: Any, commits: Any, results: Any = (), *more: Any
-) -> bool:
-    worker._demands.answer([pair for pair in results if isinstance(pair[1], InvalidInput)])
-    return publish(worker, commits, results, *more)
-
-
-@wrong(0, CommitBatch, "follow")
-def follow_nothing(_: Any, batch: Any, followed: Any, *more: Any) -> None:
-    batch.head = followed.snapshot
-
-
-@wrong(1, RemoteRepository, "publish")
-def push_on_any_tip(publish: Any, made: Any, expected: Any, commit: Any) -> Any:
-    return publish(made, made.refresh(), commit)
-
-
-@wrong(0, CommitBatch, "commit_files")
-def put_a_commit_on_the_wrong_parent(commit_files: Any, batch: Any, *given: Any) -> Any:
-    batch.head = replace(batch.head, commit=batch.start.commit)
-    return commit_files(batch, *given)
-
-
-@wrong(0, CommitBatch, "commit_files")
-def remove_no_file(commit_files: Any, batch: Any, files: Any, *given: Any) -> Any:
-    kept = {path: text for path, text in files.items() if text is not None}
-    return commit_files(batch, kept, *given)
-
-
-@wrong(2, Worker, "_attempt")
-def decide_on_a_stale_tip(attempt: Any, worker: Any, *given: Any) -> Any:
-    worker._tip_is_fresh = True
-    return attempt(worker, *given)
-
-
-plant("drop_what_a_batch_has_left", 0, Demands, "put_back", lambda *given: given[2].clear())
-
-
-@wrong(4, CommitBatch, "follow")
-def bring_back_what_was_deleted(follow: Any, batch: Any, followed: Any, now: Any) -> None:
+def undoing_deletions(follow: Wrong, batch: Any, followed: Any, now: Any) -> None:
     ledger, files = followed.snapshot.state.ledger, {}
     for claim in followed.before.state.ledger:
         if ledger.get(claim.key) is None:
@@ -352,94 +119,165 @@ def bring_back_what_was_deleted(follow: Any, batch: Any, followed: Any, now: Any
         batch.commit_files(files, state, "Undo\n\nRender-Version: 3\n", author, now)
 
 
-@wrong(382890171, Approvals, "_has_moved")
-def answer_before_a_last_merge_is_seen(moved: Any, *check: Any) -> bool:
-    return False
-
-
-@wrong(0, Approvals, "_receipt")
-def book_again_what_was_approved(
-    receipt: Any, made: Any, ticket: Any, decision: Any, snapshot: Any, recorded: Any
-) -> Receipt:
+def booking_again(
+    right: Wrong, made: Any, ticket: Any, decision: Any, snapshot: Any, *more: Any
+) -> Any:
     if isinstance(decision, Decision):
         batch = CommitBatch(made._repository, snapshot)
         text = f"Again\n\nOperation-Id: {ticket.operation}\nRender-Version: 3\n"
         author = batch._objects[snapshot.commit].author
         batch.commit_files(decision.files, decision.state, text, author, made._runtime.now())
         batch.publish()
-    return receipt(made, ticket, decision, snapshot, recorded)
+    return right(made, ticket, decision, snapshot, *more)
 
 
-plant("turn_down_what_waits", 1, ProposalBranches, "put", lambda *_: "")
-
-
-# ---- answers, withdrawals and stops ----
-
-
-@wrong(0, Demands, "fail")
-def forget_what_a_stop_leaves(
-    fail: Any, made: Any, batch: Any, error: Any, keep: bool = False
-) -> None:
-    fail(made, batch, error)
-
-
-plant("say_that_all_is_withdrawn", 1, Demands, "withdraw", lambda *_: True)
-
-
-# ---- restart ----
-
-
-plant("forget_the_journal", 0, journal, "read", lambda *_: {})
-
-
-@wrong(1, journal.Journal, "_write")
-def leave_the_journal_in_memory(write: Any, made: Any, records: Any, *, durably: bool) -> None:
-    write(made, records, durably=False)
-
-
-@wrong(1, journal.Journal, "_rewrite")
-def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
-    made.pending = dict([*made.pending.items()][-1:])
-    rewrite(made)
-
-
-plant(
-    "resume_in_reverse", 15, journal, "read", lambda read, path: dict([*read(path).items()][::-1])
-)
-plant("skip_the_search_for_operations", 16, Worker, "_published_before", lambda *_: [])
-
-
-@wrong(50, snapshot, "start_at")
-def start_without_overrides(first: Any, *given: Any) -> Any:
-    found = first(*given)
-    config = replace(found.state.config, overrides={})
-    return replace(found, state=replace(found.state, config=config))
-
-
-@wrong(0, snapshot, "_read_ledger")
-def start_without_the_last_claim(read: Any, repo: Any, before: Any, *given: Any) -> Any:
-    found = read(repo, before, *given)
-    if before is None:
-        found = found._replace(ledger=found.ledger.without([*found.ledger][-1:]))
-    return found
-
-
-_known = set[str]()
+_forgotten = set[str]()
 """The demands whose proposals a generator has forgotten at a restart."""
 
 
-def _forget_proposal(read: Any, path: Any) -> dict[str, Ticket]:
+def forgetting_proposals(read: Wrong, path: Any) -> dict[str, Ticket]:
     found = read(path)
     for ticket in found.values():
         if ticket.proposal:
-            _known.add(ticket.demand.goal.get("demand", ""))
+            _forgotten.add(ticket.demand.goal.get("demand", ""))
             ticket.proposal, ticket.state = None, "committed"
     return found
 
 
-@wrong(0, permission, "approval")
-def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> Any:
-    return ((), ()) if request.demand in _known else reasons(request, *more)
+# fmt: off
+FAULTS: dict[str, Fault] = {
+    # ---- booking ----
+    "let_strangers_change_a_demand": Fault(3, permission, "stranger_faults", lambda *_: ()),
+    "take_one_common_requester_for_the_owner": Fault(3, permission, "stranger_faults",
+        lambda faults, request, owners, *more:
+            () if {*owners} & {*request.requesters()} else faults(request, owners, *more)),
+    "release_only_the_first_claim": Fault(161, booking, "claims_of", first_only),
+    "replace_what_was_joined": Fault(2, Application, "extended", lambda _, app, more: more,
+        (Connection, "extended", lambda _, connection, more: more)),
+    "grant_one_claim_too_many": Fault(4, forbidden, "_held",
+        lambda held, *given: held(*given) - 1),
+    "commit_what_is_booked_already": Fault(6, booking, "book",
+        lambda book, ledger, item, request, key, current, now, **more:
+            (made := book(ledger, item, request, key, current, now, **more))
+            .replace(key, replace(made.get(key), booked=now))),
+    "let_a_shutdown_end_any_join_of_its_request": Fault(6, booking, "shut_down", ending_any_join),
+    "end_the_whole_claim_by_a_shutdown_of_some_topics": Fault(2, Claim, "without_topics", nothing),
+    "take_back_promised_leases": Fault(20, Lease, "started",
+        lambda started, lease, now, before=None: started(lease, now)),
+    "lose_renewals": Fault(7, Lease, "started",
+        lambda started, lease, now, before=None: before or started(lease, now)),
+    "end_leases_by_the_wall_clock": Fault(3, Agenda, "_has_grace", lambda *_: False),
+    "never_scale": Fault(1, planner, "_replicas_of", lambda _, scaling, *more: scaling.min),
+    "exceed_the_most_replicas": Fault(3, planner, "_replicas_of",
+        lambda _, scaling, parameters, topics, *more: len(topics) or 1),
+    "count_sources_for_topics": Fault(15, planner, "_replicas_of",
+        lambda right, scaling, parameters, topics, *more:
+            right(scaling, parameters, {one.source: one for one in topics}.values(), *more)),
+    "share_one_instance": Fault(3, completing, "_separated", itself),
+    "move_instances_with_the_channel": Fault(3, completing, "_separated",
+        lambda separated, app, config: replace(separated(app, config), version=app.version)),
+    "keep_the_channel_of_the_default_version": Fault(55, completing, "_separated",
+        lambda separated, app, config:
+            made if (made := separated(app, config)).separate else app),
+    "take_the_first_domain": Fault(3, Config, "nodes_of", lambda _, config, node: (node,)),
+    "forget_what_is_booked_in_a_domain": Fault(1, completing, "_chosen",
+        lambda chosen, one, booked, *more: chosen(one, {}, *more)),
 
+    # ---- routes ----
+    "carry_only_the_first_demands_routes": Fault(0, planner, "connection_topics",
+        lambda topics, claims: topics([*claims][:1])),
+    "name_a_shared_route_twice": Fault(0, connection, "merged_routes",
+        lambda _, routes: tuple(sorted(routes, key=lambda one: one.source))),
+    "deliver_under_the_source_topic": Fault(4, Route, "written_topic", lambda _, one: one.source),
+    "send_a_source_topic_to_two_targets": Fault(4, booking, "conflicts",
+        lambda conflicts, *given, **more:
+            [each for each in conflicts(*given, **more) if ".topics[" not in each.field]),
+    "leave_the_clients_of_a_released_connection": Fault(1, decision, "affected_keys",
+        lambda affected, before, after, changes: affected(before, after,
+            [one for one in changes if one.after or one.before.is_on_application])),
+    "leave_the_far_end": Fault(0, ConnectionType, "keys", first_only),
 
-FAULTS["skip_approval_after_a_restart"].parts.append((journal, "read", _forget_proposal))
+    # ---- placement ----
+    "let_the_last_in_first": Fault(9, agenda, "in_turn",
+        lambda in_turn, *given: in_turn(*given)[::-1]),
+    "ignore_priorities": Fault(187, WaitingDemand, "turn",
+        lambda _, one: (one.since, one.demand)),
+    "begin_the_wait_anew": Fault(3, decision, "_wait",
+        lambda wait, state, demand, reasons, now, *more:
+            (request := wait(state, demand, reasons, now, *more))
+            and replace(request, waiting=replace(request.waiting, since=now))),
+    "forget_those_that_wait": Fault(7, Agenda, "may_have_room", nothing),
+    "let_others_overtake_in_a_batch": Fault(13, Agenda, "book_those_let_in", nothing),
+    "leave_drained_nodes_full": Fault(3, agenda, "_to_drain", lambda *_: []),
+    "place_on_drained_nodes": Fault(1, Choice, "_closed", lambda *_: ""),
+    "choose_anew_for_a_placed_demand": Fault(14, placement, "_booked", nothing),
+    "count_no_room": Fault(7, forbidden, "excesses", lambda *_: []),
+    "count_released_room_as_taken": Fault(0, Usage, "plus",
+        lambda plus, usage, more: plus(usage, {need: n for need, n in more.items() if n > 0})),
+
+    # ---- overrides ----
+    "apply_no_override_to_what_a_demand_changes": Fault(29, decision, "plan_change",
+        lambda plan, before, after, *more: plan(before, with_(after, overrides=()), *more)),
+    "apply_overrides_only_to_new_demands": Fault(0, snapshot, "render_all",
+        lambda _, tree, state, more=None: Changeset({**(more or {})}, ())),
+    "let_the_lowest_priority_win": Fault(151, World, "__post_init__",
+        lambda right, world: [right(world), with_(world, overrides=world.overrides[::-1])]),
+    "override_all_nodes": Fault(20, overrides, "fits",
+        lambda fits, selector, traits, config:
+            bool(selector.nodes and not traits.connections) or fits(selector, traits, config)),
+    "run_what_is_denied": Fault(29, planner, "without_suspended", itself),
+    "book_what_is_denied": Fault(3, forbidden, "denial_faults", lambda *_: ()),
+    "end_overrides_early": Fault(3, edits, "expired_overrides",
+        lambda expired, one, now: expired(one, now + timedelta(minutes=2))),
+    "end_overrides_early_one_by_one": Fault(3, agenda, "_ends",
+        lambda ends, state: [(end - timedelta(minutes=2), name) for end, name in ends(state)]),
+
+    # ---- publishing ----
+    "acknowledge_before_publishing": Fault(0, Worker, "_publish_commits", answered_first(Receipt)),
+    "refuse_before_publishing": Fault(4, Worker, "_publish_commits", answered_first(InvalidInput)),
+    "follow_nothing": Fault(0, CommitBatch, "follow",
+        lambda _, batch, followed, *more: with_(batch, head=followed.snapshot)),
+    "push_on_any_tip": Fault(1, RemoteRepository, "publish",
+        lambda publish, made, expected, commit: publish(made, made.refresh(), commit)),
+    "put_a_commit_on_the_wrong_parent": Fault(0, CommitBatch, "commit_files",
+        lambda commit_files, batch, *given: commit_files(
+            with_(batch, head=replace(batch.head, commit=batch.start.commit)), *given)),
+    "remove_no_file": Fault(0, CommitBatch, "commit_files",
+        lambda commit_files, batch, files, *given: commit_files(
+            batch, {path: text for path, text in files.items() if text is not None}, *given)),
+    "decide_on_a_stale_tip": Fault(2, Worker, "_attempt",
+        lambda attempt, worker, *given: attempt(with_(worker, _tip_is_fresh=True), *given)),
+    "drop_what_a_batch_has_left": Fault(0, Demands, "put_back", lambda *given: given[2].clear()),
+    "bring_back_what_was_deleted": Fault(4, CommitBatch, "follow", undoing_deletions),
+    "answer_before_a_last_merge_is_seen": Fault(382890171, Approvals, "_has_moved",
+        lambda *_: False),
+    "book_again_what_was_approved": Fault(0, Approvals, "_receipt", booking_again),
+    "turn_down_what_waits": Fault(1, ProposalBranches, "put", lambda *_: ""),
+
+    # ---- answers, withdrawals and stops ----
+    "forget_what_a_stop_leaves": Fault(0, Demands, "fail",
+        lambda fail, made, batch, error, keep=False: fail(made, batch, error)),
+    "say_that_all_is_withdrawn": Fault(1, Demands, "withdraw", lambda *_: True),
+
+    # ---- restart ----
+    "forget_the_journal": Fault(0, journal, "read", lambda *_: {}),
+    "leave_the_journal_in_memory": Fault(1, journal.Journal, "_write",
+        lambda write, made, records, *, durably: write(made, records, durably=False)),
+    "rewrite_only_the_newest_entry": Fault(1, journal.Journal, "_rewrite",
+        lambda rewrite, made: rewrite(with_(made, pending=dict([*made.pending.items()][-1:])))),
+    "resume_in_reverse": Fault(15, journal, "read",
+        lambda read, path: dict([*read(path).items()][::-1])),
+    "skip_the_search_for_operations": Fault(16, Worker, "_published_before", lambda *_: []),
+    "start_without_overrides": Fault(50, snapshot, "start_at",
+        lambda start, *given: replace(found := start(*given), state=replace(
+            found.state, config=replace(found.state.config, overrides={})))),
+    "start_without_the_last_claim": Fault(0, snapshot, "_read_ledger",
+        lambda read, repo, before, *given:
+            found if (found := read(repo, before, *given)) and before is not None
+            else found._replace(ledger=found.ledger.without([*found.ledger][-1:]))),
+    "skip_approval_after_a_restart": Fault(0, permission, "approval",
+        lambda reasons, request, *more:
+            ((), ()) if request.demand in _forgotten else reasons(request, *more),
+        (journal, "read", forgetting_proposals)),
+}
+# fmt: on

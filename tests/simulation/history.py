@@ -20,8 +20,8 @@ from tests.kit.config import texts_below
 from tests.kit.goals import connection, goal
 from tests.kit.repo import GitRepo
 from tests.model.goals import DemandMaker, Words
-from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
 from tests.model.listed import Goal
+from tests.model.running import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY, Running
 from tests.model.view import key_in_ledger
 from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
@@ -63,11 +63,10 @@ def template() -> Path:
 
 
 class History:
-    """A random history of a world: demands, crashes, network faults and people's commits."""
-
     def __init__(self, world: World) -> None:
         self.world, self.oracle = world, Oracle(world)
         self.chance, self.turns = world.turns.chance, world.turns
+        self.repo = GitRepo(Path(world.remote.path))
         self._maker = DemandMaker(self.chance, WORDS)
         self._shutdowns: list[Goal] = []
         self._latest = 0.0
@@ -288,17 +287,17 @@ class History:
         edits += [self._move_channel, self._delete_claim] * 2
         self.chance.choice([*edits, self._edit_generated, *[self._edited_often] * 4])()
 
-    def _commit(self, changed: dict[str, str | None]) -> str:
+    def _commit(
+        self, changed: dict[str, str | None], meant: Callable[[Running], object] = lambda _: None
+    ) -> None:
+        """Commit; ``meant`` makes the same change in the model."""
         who = ("Petra Platform", "petra@example.org", int(self.turns.now().timestamp()))
-        return GitRepo(Path(self.world.remote.path)).commit(changed, "By hand\n", who)
-
-    def _files(self, under: str) -> dict[str, str]:
-        return GitRepo(Path(self.world.remote.path)).files(under)
+        self.oracle.edits[self.repo.commit(changed, "By hand\n", who)] = meant
 
     def _override(self) -> None:
         name = self.chance.choice(sorted(_OVERRIDES))
         path = f"overrides/{name}.yaml"
-        if path in self._files("overrides/") and self.chance.randrange(2):
+        if path in self.repo.files("overrides/") and self.chance.randrange(2):
             self._commit({path: None})
             return
         head = {"apiVersion": "demandops/v1", "kind": "Override"}
@@ -308,18 +307,16 @@ class History:
             file["expires"] = end.isoformat().replace("+00:00", "Z")
         self._commit({path: plain_yaml.dump(file)})
 
-    def _changed(self, path: str, change: Callable[[Any], object]) -> str:
-        """Commit a change of a file's data; return the commit's id."""
-        data = plain_yaml.load(self._files(path)[path])
+    def _change(self, path: str, change: Callable[[Any], object], *meant: Any) -> None:
+        data = plain_yaml.load(self.repo.files(path)[path])
         change(data)
-        return self._commit({path: plain_yaml.dump(data)})
+        self._commit({path: plain_yaml.dump(data)}, *meant)
 
     def _inventory(self) -> None:
-        def add(data: Any) -> None:
-            car = {"id": f"car{len(data['nodes'])}", "type": "vehicle", "cluster": "c-its"}
-            data["nodes"].append(car)
-
-        self._changed(NODES, add)
+        car = {"type": "vehicle", "cluster": "c-its"}
+        self._change(
+            NODES, lambda data: data["nodes"].append(car | {"id": f"car{len(data['nodes'])}"})
+        )
 
     def _drain(self) -> None:
         self.oracle.check()
@@ -332,23 +329,23 @@ class History:
             (node,) = (one for one in data["nodes"] if one["id"] == name)
             node["drained"] = drained
 
-        commit = self._changed(NODES, drain)
-        self.oracle.edits[commit] = lambda books: books.drain(name, drained)
+        self._change(NODES, drain, lambda books: books.drain(name, drained))
 
     def _stop_waiting(self) -> None:
         self.oracle.check()
-        if found := sorted(self._files("ledger/waiting").items()):
+        if found := sorted(self.repo.files("ledger/waiting").items()):
             path, text = self.chance.choice(found)
             demand = plain_yaml.load(text)["goal"]["demand"]
-            self.oracle.edits[self._commit({path: None})] = lambda books: books.waiting.pop(demand)
+            self._commit({path: None}, lambda books: books.waiting.pop(demand))
 
     def _move_channel(self) -> None:
         self.oracle.check()
         version = self.chance.choice([DEFAULT, NEXT])
-        commit = self._changed(
-            VERSIONS, lambda data: data["applications"][TALLY]["channels"].update(testing=version)
+        self._change(
+            VERSIONS,
+            lambda data: data["applications"][TALLY]["channels"].update(testing=version),
+            lambda books: setattr(books, "testing", version),
         )
-        self.oracle.edits[commit] = lambda books: setattr(books, "testing", version)
 
     def _delete_claim(self) -> None:
         self.oracle.check()
@@ -356,11 +353,10 @@ class History:
         if found:
             path, claim = self.chance.choice(found)
             gone = self.oracle.key_of(key_in_ledger(claim.key))
-            self.oracle.edits[self._commit({path: None})] = lambda books: books.drop([gone])
+            self._commit({path: None}, lambda books: books.drop([gone]))
 
     def _edit_generated(self) -> None:
-        found = sorted(path for path in self._files("clusters/") if path.endswith(".yaml"))
-        path = self.chance.choice(found)
+        path = self.chance.choice(sorted(self.repo.manifests()))
         self._commit({path: self.chance.choice([None, "hand: made\n"])})
 
     def _branches(self) -> list[str]:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pickle
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timezone
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,8 @@ from demandops.serve.journal import Ticket
 from tests.kit import plain_yaml
 from tests.model import books, view
 from tests.model.goals import SKELETON
-from tests.model.instances import FURTHER, NEXT
 from tests.model.listed import Goal, Subject
-from tests.model.running import Link, Override, Running, Service
+from tests.model.running import FURTHER, NEXT, Link, Override, Running, Service
 from tests.simulation.world import Machine, World
 
 SLACK_S = 30
@@ -74,8 +73,6 @@ class Asked:
 
 
 class Oracle:
-    """Fails if the model does not allow a commit of main or an answer."""
-
     def __init__(self, world: World) -> None:
         self.world = world
         self.asked: dict[str, Asked] = {}
@@ -105,7 +102,7 @@ class Oracle:
         assert machine.generator is not None
         ticket = machine.generator.submit(goal)
         is_ours = goal.get("kind") == "Demand"
-        time = turns.monotonic() if is_ours else self.world.time_of(ticket.received)
+        time = turns.monotonic() if is_ours else ticket.received.timestamp()
         place, number = len(self._models) - 1, len(self.asked)
         asked = Asked(goal, machine, ticket, time, place, number)
         self.asked[ticket.operation] = asked
@@ -157,8 +154,7 @@ class Oracle:
         self.books.chosen = {
             subject: what["node"] for (subject, _), (what, _) in claims.items() if "node" in what
         }
-        if str(commit.id) in self.edits:
-            self.edits[str(commit.id)](self.books)
+        self.edits.get(str(commit.id), lambda books: None)(self.books)
         self._follow_overrides(commit)
         for operation, branch in self._operations(commit):
             assert operation not in self._place, f"{operation} is booked twice"
@@ -186,30 +182,27 @@ class Oracle:
         _assert_same(commit, claims, view.claims_of(self.books))
         _assert_same(commit, self._waiting_on(commit), self.books.waiting_files())
         if entry_of(commit).by_generator:
-            self._compare_replicas(commit)
-            services, links = _rendered(commit)
+            expected = [
+                (
+                    "city" if one[1] == FURTHER else "perception",
+                    one[0].partition("@")[2],
+                    sorted(topics),
+                    self.books.replicas(one),
+                )
+                for one, topics in self.books.demanded().items()
+            ]
+            instances, services, links = _rendered(commit)
+            _assert_same(commit, sorted(instances), sorted(expected))
             _assert_same(commit, services, self.books.services())
             _assert_same(commit, links, self.books.links())
         self.books.chosen = {}
         self._claims = claims
         self._models.append(pickle.dumps(self.books))
 
-    def _compare_replicas(self, commit: pygit2.Commit) -> None:
-        expected = [
-            (
-                "city" if one[1] == FURTHER else "perception",
-                one[0].partition("@")[2],
-                sorted(topics),
-                self.books.replicas(one),
-            )
-            for one, topics in self.books.demanded().items()
-        ]
-        _assert_same(commit, sorted(_rendered_instances(commit)), sorted(expected))
-
     def _follow_overrides(self, commit: pygit2.Commit) -> None:
         """Update the model with the overrides of a commit; fail if one ended before its time."""
         overrides, ended = _overrides(commit)
-        latest = _made(commit) + timedelta(seconds=1)
+        latest = datetime.fromtimestamp(commit.commit_time + 1, timezone.utc)
         for override in overrides:
             early = f"{override.name} ended before {override.end}"
             is_new = override.name in ended and override not in self._ended
@@ -222,7 +215,6 @@ class Oracle:
         return {subject: claim.content() for subject, claim in held.items()}
 
     def key_of(self, key: view.Key) -> books.Key:
-        """Return the model's key of a claim of the ledger."""
         return next(one for one in self.books.claims if view.key_of(one) == key)
 
     def _take(self, books: Running, asked: Asked, time: float) -> str:
@@ -240,7 +232,8 @@ class Oracle:
     def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:
         """Follow what a generator did by itself: it ends leases, lets in and moves."""
         both = self._claims.keys() & claims.keys()
-        moved = {one for one in both if _node(self._claims[one]) != _node(claims[one])}
+        before = self._claims
+        moved = {one for one in both if before[one][0].get("node") != claims[one][0].get("node")}
         let_in = {demand for _, demand in claims.keys() - both}
         self.counts.update(let_in=len(let_in), moved=len(moved))
         for demand in let_in:
@@ -410,12 +403,7 @@ def _assert_same(commit: pygit2.Commit, found: object, expected: object) -> None
     assert found == expected, f"after {commit.message}\n{found}\nbut expected\n{expected}"
 
 
-def _made(commit: pygit2.Commit) -> datetime:
-    return datetime.fromtimestamp(commit.commit_time, timezone.utc)
-
-
 def _overrides(commit: pygit2.Commit) -> tuple[list[Override], set[str]]:
-    """Return the overrides of a commit, and the names of those that have ended."""
     found = [
         Override.read(Path(path).stem, plain_yaml.load(text))
         for path, text in trees.texts(commit.tree, ["overrides"]).items()
@@ -428,20 +416,25 @@ def _overrides(commit: pygit2.Commit) -> tuple[list[Override], set[str]]:
 
 def _rendered(
     commit: pygit2.Commit,
-) -> tuple[dict[Service, tuple[list[str], int]], dict[Link, dict[str, str]]]:
-    """Return the rendered services and connections; both clients must name topics alike."""
+) -> tuple[list[Any], dict[Service, tuple[list[str], int]], dict[Link, dict[str, str]]]:
+    """Return the rendered instances of the tally (with their namespaces and versions), services
+    and connections; both clients must name topics alike.
+    """
+    instances = []
     services: dict[Service, tuple[list[str], int]] = {}
     ends: dict[tuple[str, str], tuple[str, dict[str, str]]] = {}
     for path, blob in trees.blobs(commit.tree, ["clusters"]):
         name, node = Path(path).stem, Path(path).parent.name
         if name.startswith("of-"):
-            services[name.removeprefix("of-"), node] = _rendered_service(trees.text_of(blob))
+            services[name.removeprefix("of-"), node] = _rendered_service(trees.text_of(blob))[2:]
+        elif name.startswith("ta-"):
+            instances.append(_rendered_service(trees.text_of(blob)))
         elif name.startswith("mqtt-"):
             _, id, end = name.split("-")
             assert (id, end) not in ends, f"{id} has two clients at its {end}"
             ends[id, end] = node, _carried(trees.text_of(blob))
         else:
-            assert name.startswith(("_", "ta-", "README")) or "/_" in path, f"{path} is not needed"
+            assert name.startswith(("_", "README")) or "/_" in path, f"{path} is not needed"
     links: dict[Link, dict[str, str]] = {}
     for (id, end), (source, sent) in ends.items():
         if end == "source":
@@ -450,13 +443,16 @@ def _rendered(
             assert sorted(told) == sorted(sent.values()), f"{id} sends {sent} and reads {read}"
             links[id, source, target] = {topic: told[named] for topic, named in sent.items()}
     assert len(ends) == 2 * len(links), f"a client lacks its other end: {sorted(ends)}"
-    return services, links
+    return instances, services, links
 
 
 @lru_cache(maxsize=1024)
-def _rendered_service(text: str) -> tuple[list[str], int]:
-    values = plain_yaml.load(text)["spec"]["values"]
-    return sorted(values["inputs"]["egoData"]), values["replicas"]
+def _rendered_service(text: str) -> tuple[str, str, list[str], int]:
+    release = plain_yaml.load(text)
+    values = release["spec"]["values"]
+    version = NEXT if values["image"]["tag"] == NEXT else ""
+    topics = sorted(values["inputs"]["egoData"])
+    return release["metadata"]["namespace"], version, topics, values["replicas"]
 
 
 @lru_cache(maxsize=1024)
@@ -469,21 +465,3 @@ def _carried(text: str) -> dict[str, str]:
     found += [(read[named]["ros_topic"], named) for named in read.get("mqtt_topics", ())]
     assert len(dict(found)) == len(found), f"a topic is carried twice: {found}"
     return dict(found)
-
-
-def _rendered_instances(commit: pygit2.Commit) -> Iterator[tuple[str, str, list[str], int]]:
-    for path, blob in trees.blobs(commit.tree, ["clusters"]):
-        if Path(path).name.startswith("ta-"):
-            yield _rendered_instance(trees.text_of(blob))
-
-
-@lru_cache(maxsize=1024)
-def _rendered_instance(text: str) -> tuple[str, str, list[str], int]:
-    release = plain_yaml.load(text)
-    values, tag = release["spec"]["values"], release["spec"]["values"]["image"]["tag"]
-    version, topics = tag if tag == NEXT else "", sorted(values["inputs"]["egoData"])
-    return release["metadata"]["namespace"], version, topics, values["replicas"]
-
-
-def _node(claim: view.Content) -> object:
-    return claim[0].get("node")

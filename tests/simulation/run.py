@@ -9,7 +9,6 @@ on what else the machine does.
 from __future__ import annotations
 
 import gc
-import json
 import logging
 import os
 import random
@@ -17,13 +16,10 @@ import sys
 import time
 import traceback
 from collections import Counter
-from pathlib import Path
 
 from tests.kit import repo
 from tests.kit.repo import NO_GIT_CONFIG
 from tests.simulation.history import clean_up, play, template
-
-RESULTS = Path("build/simulate.json")
 
 
 def main() -> int:
@@ -54,18 +50,9 @@ def main() -> int:
     finally:
         minutes = (time.process_time() - began) / 60
         clean_up()
-    before = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    total = Counter(before) + counts
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps(total, indent=2) + "\n")
-    print("this run:", as_line(counts))
-    print("all runs:", as_line(total))
+    print(", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items()))
     print(f"{counts['histories'] / minutes:.0f} histories in each minute of processor time")
     return 1 if counts["failures"] else 0
-
-
-def as_line(counts: Counter[str]) -> str:
-    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from datetime import datetime, timedelta
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -36,10 +35,8 @@ class Machine(Runtime):
     def __init__(self, world: World, name: str) -> None:
         super().__init__()
         self.world, self.name, self.turns = world, name, world.turns
-        self.now, self.monotonic = self.turns.now, self.turns.monotonic  # type: ignore[method-assign]
-        self.uniform, self.fresh_id = self.turns.uniform, self.turns.fresh_id  # type: ignore[method-assign]
-        self.sleep, self.event = self.turns.sleep, self.turns.event  # type: ignore[method-assign]
-        self.condition = self.turns.condition  # type: ignore[method-assign]
+        for each in ("now", "monotonic", "uniform", "fresh_id", "sleep", "event", "condition"):
+            setattr(self, each, getattr(self.turns, each))
         self.when_unsound = self.crash
         self.generator: Generator | None = None
         self.is_up = False
@@ -94,17 +91,19 @@ class Machine(Runtime):
         stopped = self.generator.stop(timeout)
         self.turns.wait(lambda: stopped.done() or not self.is_up)
         if self.is_up:
-            self.world.dead += self.threads
-            self.is_up, self.generator, self.crashes_in, self.threads = False, None, 0, []
+            self._forget_generator()
+
+    def _forget_generator(self) -> list[Any]:
+        """Return its threads, which are unwound at the end of the history."""
+        self.is_up, self.generator, self.crashes_in = False, None, 0
+        threads, self.threads = self.threads, []
+        self.world.dead += threads
+        return threads
 
     def crash(self) -> None:
         """Stop all threads and lose what is not on the disk, which they cannot reach."""
-        self.world.dead += self.threads
-        self.is_up, self.generator, self.crashes_in = False, None, 0
-        old, self.folder = (
-            self.folder,
-            self.world.folder / f"{self.name}-{next(self.world.numbers)}",
-        )
+        threads, old = self._forget_generator(), self.folder
+        self.folder = self.world.folder / f"{self.name}-{next(self.world.numbers)}"
         slot = self.folder / "slot-0"
         slot.mkdir(parents=True)
         if (text := self.disk.left_of(old / "slot-0")) is not None:
@@ -113,8 +112,8 @@ class Machine(Runtime):
         if clone.exists() and self.turns.chance.randrange(4):
             clone.rename(slot / "clone.git")
         self.disk = Disk(self)
-        self.disk.sync_all(slot)
-        threads, self.threads = self.threads, []
+        for path in (*slot.glob(_JOURNAL), slot):
+            self.disk.sync(path)
         self.turns.stop(threads)
 
 
@@ -134,10 +133,6 @@ class Disk:
         else:
             self._contents[path.stat().st_ino] = path.read_bytes()
         self._machine.may_crash()
-
-    def sync_all(self, folder: Path) -> None:
-        for path in (*folder.glob(_JOURNAL), folder):
-            self.sync(path)
 
     def left_of(self, folder: Path) -> bytes | None:
         """Return what is left of a journal after a crash of the process or of the whole machine."""
@@ -238,7 +233,8 @@ class Clone(RemoteRepository):
         return GitResult(0, "\n".join(lines), "")
 
     def _push_there(self, *arguments: str) -> GitResult:
-        references = self._machine.world.remote.references
+        world = self._machine.world
+        references = world.remote.references
         (lease,) = [each for each in arguments if each.startswith("--force-with-lease=")]
         reference, _, expected = lease.partition("=")[2].partition(":")
         commit = arguments[-1].split(":")[0]
@@ -249,15 +245,12 @@ class Clone(RemoteRepository):
             references.delete(reference)
             return _pushed(arguments, "[deleted]", 0)
         if reference == MAIN:
-            if not self._machine.world.remote.descendant_of(commit, now):
-                self._machine.world.failure = AssertionError("history was rewritten")
-            self._machine.world.pushed_by[commit] = (
-                self._machine,
-                self._machine.started_at,
-                self._machine.monotonic(),
-            )
+            if not world.remote.descendant_of(commit, now):
+                world.failure = AssertionError("history was rewritten")
+            machine = self._machine
+            world.pushed_by[commit] = machine, machine.started_at, machine.monotonic()
         references.create(reference, commit, force=True)
-        self._machine.world.on_push()
+        world.on_push()
         return _pushed(arguments, f"{now}..{commit}", 0)
 
 
@@ -318,7 +311,3 @@ class World:
         self.turns.set_by(seconds)
         if seconds > 0:
             self.last_jump = self.turns.monotonic()
-
-    def time_of(self, moment: datetime) -> float:
-        """Return a wall-clock time as a number of seconds; only differences of results count."""
-        return (moment - datetime(2026, 1, 1, tzinfo=moment.tzinfo)) / timedelta(seconds=1)

@@ -27,7 +27,7 @@ from demandops.cli import main
 from demandops.cli.authoring import schema
 from demandops.cli.authoring.schema import SCHEMAS
 
-from tests.golden.cases import CASES, whole
+from tests.golden.cases import CASES, rendered
 
 ROOT = Path(__file__).parents[2]
 INTERFACES = ROOT / "ros_bridge" / "interfaces"
@@ -91,7 +91,7 @@ def interfaces() -> Json:
 def claim_files() -> Json:
     """Return the fields of the claims in the golden cases, by version and kind."""
     found: dict[str, set[str]] = {}
-    steps = (files for case in CASES for files in whole(case).values())
+    steps = (files for case in CASES for files in rendered(case).values())
     texts = {text for files in steps for path, text in files.items() if path.startswith("ledger/")}
     for claim in map(yaml.safe_load, texts):
         names = found.setdefault(f"{claim['apiVersion']} {claim['kind']}", set())

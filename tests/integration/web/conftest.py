@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import yaml
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.views.causes import Cause
@@ -33,8 +32,6 @@ owner: traffic-control
 select: [{connections: [vehicle01/edge]}]
 deny: true
 """
-
-Look = Callable[..., Page]
 
 
 @dataclass(frozen=True)
@@ -60,7 +57,7 @@ class Shown:
 @contextmanager
 def showing(bare: Path) -> Iterator[Shown]:
     with running(bare) as generator:
-        book(generator, *(yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT[:2]))
+        book(generator, *map(goals.experiment, (1, 2)))
         follower = Follower(Reader.of(str(bare)), {}, 0)
         site = Site(follower, ("127.0.0.1", "localhost"))
         client = TestClient(site.application, base_url="http://127.0.0.1:8080")
@@ -80,26 +77,6 @@ def still(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
     bare = tmp_path_factory.mktemp("still") / "state.git"
     with showing(Path(shutil.copytree(bare_template, bare))) as made:
         yield made
-
-
-@pytest.fixture
-def booked(shown: Shown) -> Generator:
-    return shown.generator
-
-
-@pytest.fixture
-def follower(shown: Shown) -> Follower:
-    return shown.follower
-
-
-@pytest.fixture
-def client(shown: Shown) -> TestClient:
-    return shown.client
-
-
-@pytest.fixture
-def look(shown: Shown) -> Look:
-    return shown.look
 
 
 def causes(source: Source, text: str = "") -> list[Cause]:

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import yaml
 from demandops.cli.main import run
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
@@ -24,7 +23,7 @@ from demandops.web.page_views import LISTS
 from demandops.web.server import Site
 from starlette.testclient import TestClient
 
-from tests.integration.web.conftest import DENY, VIEWS, Look, causes
+from tests.integration.web.conftest import DENY, VIEWS, Shown, causes
 from tests.integration.web.html import Page
 from tests.kit import goals
 from tests.kit.config import override
@@ -52,11 +51,9 @@ def typed(page: Page, state: GitRepo) -> None:
     )
 
 
-def test_a_denied_connection_is_told_everywhere(
-    booked: Generator, person: Person, follower: Follower, look: Look
-) -> None:
+def test_a_denied_connection_is_told_everywhere(shown: Shown, person: Person) -> None:
     def figures(**asked: str) -> list[str]:
-        return look("/", **asked).texts("li")[:7]
+        return shown.look("/", **asked).texts("li")[:7]
 
     assert figures() == [
         "9 releases 9 unknown",
@@ -67,51 +64,51 @@ def test_a_denied_connection_is_told_everywhere(
         "0 waiting",
         "2 changes in the last hour 2 booked, 0 released in the last day",
     ]
-    book(booked, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
+    book(shown.generator, goals.experiment(1) | {"shutdown": True})
     person.override(roadworks=DENY)
     person.change({"README.md": "hello"}, "Greet")
-    overridden(booked)
-    page = look("/")
+    overridden(shown.generator)
+    page = shown.look("/")
     assert page.texts("h1") == ["1 of 1 application is not ready"]
-    (cause,) = causes(follower.newest)
+    (cause,) = causes(shown.follower.newest)
     assert (cause.kind, cause.told) == ("suspended", "The road is closed")
     assert cause.who == "traffic-control, who owns the override"
     assert cause.command == "demandops override end roadworks"
     assert cause.requesters == ("station00", "vehicle01")
-    changed = follower.newest.last_change("overrides/roadworks.yaml")
+    changed = shown.follower.newest.last_change("overrides/roadworks.yaml")
     assert changed and cause.since == changed.time
     assert "vehicle01/edge is booked, but overrides/roadworks.yaml denies it" in page.text
     assert "1 override: 1 in force" in page.text
-    assert "vehicle01/edge" not in look("/connections").text
+    assert "vehicle01/edge" not in shown.look("/connections").text
     for path in VIEWS:
-        look(path)
+        shown.look(path)
     told = figures(q="vehicle01")
     assert told[1:3] == ["1 connection 1 unknown", "1 demand 1 unknown"]
     assert "1 booked, 0 released in the last day" in told[-1]
     assert "1 booked, 1 released" not in told[-1] and "1 released in the last day" in figures()[-1]
-    page = look("/release", name=DETECTION)
+    page = shown.look("/release", name=DETECTION)
     assert "It is gone since" in page.text and "stopped" in page.texts("td")
-    assert len(look("/timeline", lane="demands").texts("tr")[1:]) == 3
-    assert "A person's change" in look("/timeline", lane="overrides").text
-    assert "Greet" in look("/timeline", lane="people").text
-    assert len(look("/timeline", q="who:vehicle01").texts("tr")[1:]) == 1
+    assert len(shown.look("/timeline", lane="demands").texts("tr")[1:]) == 3
+    assert "A person's change" in shown.look("/timeline", lane="overrides").text
+    assert "Greet" in shown.look("/timeline", lane="people").text
+    assert len(shown.look("/timeline", q="who:vehicle01").texts("tr")[1:]) == 1
 
 
 def test_an_application_that_others_demand_too_runs_on_without_a_suspended_requester(
-    booked: Generator, person: Person, follower: Follower, look: Look
+    shown: Shown, person: Person
 ) -> None:
     person.override(workshop=override({"requesters": ["vehicle00"]}, deny=True))
-    overridden(booked)
-    assert look("/").texts("h1") == ["1 thing needs attention"]
-    (cause,) = causes(follower.newest)
+    overridden(shown.generator)
+    assert shown.look("/").texts("h1") == ["1 thing needs attention"]
+    (cause,) = causes(shown.follower.newest)
     assert (cause.kind, cause.applications) == ("suspended", ())
-    page = look("/thing", kind="requester", name="vehicle00")
+    page = shown.look("/thing", kind="requester", name="vehicle00")
     assert "kind=override&name=workshop" in page.link("workshop")
 
 
 def test_an_override_that_no_generator_carried_out_yet_is_told(bare: Path, state: GitRepo) -> None:
     with running(bare) as generator:
-        book(generator, *(yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT[:2]))
+        book(generator, *map(goals.experiment, (1, 2)))
     state.commit({"overrides/roadworks.yaml": DENY})
     follower = Follower(Reader.of(str(bare)), {}, 0)
     client = TestClient(Site(follower, ("127.0.0.1",)).application, base_url="http://127.0.0.1")
@@ -122,19 +119,15 @@ def test_an_override_that_no_generator_carried_out_yet_is_told(bare: Path, state
 
 
 def test_an_invalid_file_names_who_wrote_it_and_too_many_causes_are_counted(
-    booked: Generator,
-    person: Person,
-    follower: Follower,
-    look: Look,
-    monkeypatch: pytest.MonkeyPatch,
+    shown: Shown, person: Person, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     person.change({"registry/images.yaml": "images: [\n", "registry/charts.yaml": "charts: [\n"})
     person.change({"overrides/wrong.yaml": "kind: nothing\n"})
-    booked.fetch_now()
-    wait_until(lambda: len(booked.snapshot.problems) > 2, "the generator reports it")
-    page = look("/")
-    of_commits = causes(follower.newest)
-    assert len(follower.newest.problems) > len(of_commits) == 2
+    shown.generator.fetch_now()
+    wait_until(lambda: len(shown.generator.snapshot.problems) > 2, "the generator reports it")
+    page = shown.look("/")
+    of_commits = causes(shown.follower.newest)
+    assert len(shown.follower.newest.problems) > len(of_commits) == 2
     assert "\noverrides/wrong.yaml:1: kind: is 'nothing'" in "".join(c.told for c in of_commits)
     for cause in of_commits:
         assert cause.kind == "invalid"
@@ -143,23 +136,26 @@ def test_an_invalid_file_names_who_wrote_it_and_too_many_causes_are_counted(
     assert "stays in effect" in page.text and "git revert --no-edit -m 1 " in page.text
     assert "more causes" not in page.text
     monkeypatch.setattr(page_views, "_MOST_CAUSES", 1)
-    page = look("/")
+    page = shown.look("/")
     assert len(page.texts("h3")) == 1 and "and 1 more causes; filter to see them" in page.text
     assert page.texts("h1") == ["2 things need attention"]
 
 
 def test_a_lease_is_listed_and_the_consequence_of_its_release_is_what_follows(
-    booked: Generator, look: Look, state: GitRepo
+    shown: Shown, state: GitRepo
 ) -> None:
-    book(booked, goals.put("mine", "vehicle02", applications=[], connections=[LINK], lease="10m"))
-    (row,) = look("/leases").texts("tr")[1:]
+    book(
+        shown.generator,
+        goals.put("mine", "vehicle02", applications=[], connections=[LINK], lease="10m"),
+    )
+    (row,) = shown.look("/leases").texts("tr")[1:]
     assert re.match(r"mine in [0-9m]+s? vehicle02 10m vehicle02/cloud", row)
-    page = look("/demand", id="mine")
+    page = shown.look("/demand", id="mine")
     told = {e.text.strip() for e in page.all("a") if "li" in e.inside and "main" in e.inside}
     before = set(state.manifests())
     typed(page, state)
-    booked.fetch_now()
-    wait_until(lambda: str(booked.snapshot.commit) == state.tip, "the generator knows")
+    shown.generator.fetch_now()
+    wait_until(lambda: str(shown.generator.snapshot.commit) == state.tip, "the generator knows")
     gone = {Path(path).stem for path in before - set(state.manifests())}
     assert gone == told and len(gone) == 2
 
@@ -172,16 +168,16 @@ def test_a_lease_is_listed_and_the_consequence_of_its_release_is_what_follows(
     ],
 )
 def test_the_command_that_stops_a_release_stops_it(
-    booked: Generator, look: Look, state: GitRepo, release: str, told: str
+    shown: Shown, state: GitRepo, release: str, told: str
 ) -> None:
-    page = look("/release", name=release)
+    page = shown.look("/release", name=release)
     (promise,) = [text for text in page.texts("p") if "That stops it" in text]
     before = set(state.manifests())
     typed(page, state)
-    overridden(booked)
-    assert look("/release", name=release).texts("h1") != [f"Release {release} unknown"]
+    overridden(shown.generator)
+    assert shown.look("/release", name=release).texts("h1") != [f"Release {release} unknown"]
     (name,) = state.files("overrides/suspend-")
-    assert told.format(name) in look("/").text
+    assert told.format(name) in shown.look("/").text
     gone = {Path(path).stem for path in before - set(state.manifests())}
     assert release in gone
     named = {word for word in re.split(r"[ ,.]+", promise) if word.startswith(("od-", "mqtt-"))}
@@ -206,25 +202,25 @@ def test_the_command_serves_the_page_until_it_is_stopped(bare: Path) -> None:
 
 
 def test_views_derived_step_by_step_equal_views_derived_from_scratch(
-    booked: Generator, person: Person, follower: Follower, look: Look
+    shown: Shown, person: Person
 ) -> None:
     appdef = "appdefs/object-detection-fusion/appdef.yaml"
     scaling = "{max: 4, per: {sources: 1}, dividesWork: true}"
     text = person.read(appdef).replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")
     person.change({appdef: text}, "Scale")
-    wait_until(lambda: follower.newest.config.files[appdef] == text, "it is shown")
-    joins = [yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT]
+    wait_until(lambda: shown.follower.newest.config.files[appdef] == text, "it is shown")
+    joins = [*map(goals.experiment, range(1, 9))]
     another = copy.deepcopy(joins[0]) | {"connections": []}
     another["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station01"]
     for goal in (joins[2], another, another | {"shutdown": True}, *joins[3:]):
-        book(booked, goal)
-        _assert_taken_over(follower, look)
+        book(shown.generator, goal)
+        _assert_taken_over(shown)
 
 
-def _assert_taken_over(follower: Follower, look: Look) -> None:
+def _assert_taken_over(shown: Shown) -> None:
     for name in LISTS:
-        look(f"/{name}")
-    now = follower.newest
+        shown.look(f"/{name}")
+    now = shown.follower.newest
     anew = replace(now, derived={})
     assert now.targets == anew.targets
     assert now.claims_of_releases == anew.claims_of_releases
@@ -232,38 +228,38 @@ def _assert_taken_over(follower: Follower, look: Look) -> None:
         assert sorted(map(str, rows_of(now, name))) == sorted(map(str, rows_of(anew, name)))
 
 
-def test_what_is_gone_has_a_list_of_its_own(booked: Generator, look: Look) -> None:
+def test_what_is_gone_has_a_list_of_its_own(shown: Shown) -> None:
     made = goals.put("mine", "vehicle02", applications=[], connections=[LINK])
     over = {"kind": "Demand", "operation": "release", "demand": "mine", "requesters": ["vehicle02"]}
-    book(booked, made, over)
-    assert "mine" not in look("/demands").text
-    page = look("/demands", gone="1")
+    book(shown.generator, made, over)
+    assert "mine" not in shown.look("/demands").text
+    page = shown.look("/demands", gone="1")
     (row,) = page.texts("tr")[1:]
     assert re.match(r"mine gone [0-9]+s ago by .*, release in [0-9a-f]{10} vehicle02", row)
-    assert "gone=1" in look("/connections").link("Those that are gone")
+    assert "gone=1" in shown.look("/connections").link("Those that are gone")
     for name in LISTS:
-        look(f"/{name}", gone="1")
+        shown.look(f"/{name}", gone="1")
 
 
-def test_a_state_repo_that_is_away_is_told_and_followed_again(
-    bare: Path, follower: Follower, look: Look, client: TestClient
-) -> None:
+def test_a_state_repo_that_is_away_is_told_and_followed_again(shown: Shown, bare: Path) -> None:
     with away(bare):
-        wait_until(lambda: follower.newest.unread, "the page knows that the state repo is away")
-        page = look("/", status=200)
+        wait_until(
+            lambda: shown.follower.newest.unread, "the page knows that the state repo is away"
+        )
+        page = shown.look("/", status=200)
         assert "The state repo cannot be read" in page.text
-        assert "may be out of date" in look("/demands").texts("aside")[0]
-        assert client.get("/health").status_code == 503
-    wait_until(lambda: not follower.newest.unread, "the page follows again")
-    assert client.get("/health").status_code == 200
+        assert "may be out of date" in shown.look("/demands").texts("aside")[0]
+        assert shown.client.get("/health").status_code == 503
+    wait_until(lambda: not shown.follower.newest.unread, "the page follows again")
+    assert shown.client.get("/health").status_code == 200
 
 
 def test_a_server_that_takes_no_commit_of_the_node_is_told(
-    follower: Follower, look: Look, monkeypatch: pytest.MonkeyPatch
+    shown: Shown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(follower, "_push_denied", lambda: "ERROR: the key is read-only")
-    follower.wake()
-    wait_until(lambda: follower.newest.push_denied, "the page knows")
-    told = look("/", status=200).text
+    monkeypatch.setattr(shown.follower, "_push_denied", lambda: "ERROR: the key is read-only")
+    shown.follower.wake()
+    wait_until(lambda: shown.follower.newest.push_denied, "the page knows")
+    told = shown.look("/", status=200).text
     assert "takes no commit of this generator" in told
     assert "the key is read-only" in told

@@ -18,20 +18,9 @@ from tests.kit import plain_yaml
 ASKED = plain_yaml.beside(__file__)
 
 
-@pytest.fixture
-def shown(still: Shown) -> Shown:
-    """The site that tests share, because these tests change nothing."""
-    return still
-
-
-@pytest.fixture
-def bare(still: Shown) -> Path:
-    return still.bare
-
-
 @pytest.mark.parametrize("path", VIEWS)
-def test_every_answer_forbids_what_the_page_does_not_need(client: TestClient, path: str) -> None:
-    answer = client.get(path)
+def test_every_answer_forbids_what_the_page_does_not_need(still: Shown, path: str) -> None:
+    answer = still.client.get(path)
     policy = answer.headers["content-security-policy"]
     assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self';")
     assert "unsafe" not in policy
@@ -48,18 +37,20 @@ def test_every_answer_forbids_what_the_page_does_not_need(client: TestClient, pa
     assert page.all("style") == []
 
 
-def test_nothing_can_be_sent(client: TestClient) -> None:
+def test_nothing_can_be_sent(still: Shown) -> None:
     for method in ("POST", "PUT", "PATCH", "DELETE"):
-        assert {client.request(method, path).status_code for path in (*VIEWS, "/events")} == {405}
+        assert {still.client.request(method, path).status_code for path in (*VIEWS, "/events")} == {
+            405
+        }
 
 
 def test_the_documentation_comes_with_the_page_where_it_was_built(
-    shown: Shown, tmp_path: Path
+    still: Shown, tmp_path: Path
 ) -> None:
-    assert "Documentation" not in shown.client.get("/").text
-    assert shown.client.get("/docs/index.html").status_code == 404
+    assert "Documentation" not in still.client.get("/").text
+    assert still.client.get("/docs/index.html").status_code == 404
     tmp_path.joinpath("index.html").write_text("<script>1</script>")
-    site = Site(shown.follower, documentation=tmp_path)
+    site = Site(still.follower, documentation=tmp_path)
     client = TestClient(site.application)
     assert '<a href="/docs/index.html">Documentation</a>' in client.get("/").text
     page = client.get("/docs/index.html")
@@ -70,37 +61,37 @@ def test_the_documentation_comes_with_the_page_where_it_was_built(
         assert "default-src 'none'" in client.get(path).headers["Content-Security-Policy"]
 
 
-def test_another_name_of_this_machine_is_refused(client: TestClient) -> None:
+def test_another_name_of_this_machine_is_refused(still: Shown) -> None:
     """Else another site, whose name points to this machine, reads the page (DNS rebinding)."""
-    refused = client.get("/", headers={"Host": "attacker.example"})
+    refused = still.client.get("/", headers={"Host": "attacker.example"})
     assert refused.status_code == 400
-    assert client.get("/", headers={"Host": "localhost:8080"}).status_code == 200
+    assert still.client.get("/", headers={"Host": "localhost:8080"}).status_code == 200
 
 
 @pytest.mark.parametrize("case", ASKED["elsewhere"])
-def test_what_another_site_makes_a_browser_ask_is_refused(client: TestClient, case: str) -> None:
+def test_what_another_site_makes_a_browser_ask_is_refused(still: Shown, case: str) -> None:
     for path in ("/", "/services?at=HEAD", "/events", "/health", "/static/page.js"):
-        refused = client.get(path, headers=ASKED["elsewhere"][case])
+        refused = still.client.get(path, headers=ASKED["elsewhere"][case])
         assert refused.status_code == 403
         assert "default-src 'none'" in refused.headers["Content-Security-Policy"]
 
 
-def test_what_the_page_or_its_visitor_asks_is_answered(client: TestClient) -> None:
+def test_what_the_page_or_its_visitor_asks_is_answered(still: Shown) -> None:
     here = ASKED["here"]
-    answers = {case: client.get("/", headers=here[case]).status_code for case in here}
+    answers = {case: still.client.get("/", headers=here[case]).status_code for case in here}
     assert answers == dict.fromkeys(here, 200)
 
 
 def test_an_address_that_others_reach_is_warned_of(
-    bare: Path, caplog: pytest.LogCaptureFixture
+    still: Shown, caplog: pytest.LogCaptureFixture
 ) -> None:
-    server = WebServer("0.0.0.0:0", "--listen", Follower(Reader.of(str(bare)), {}, 0))
+    server = WebServer("0.0.0.0:0", "--listen", Follower(Reader.of(str(still.bare)), {}, 0))
     server.close()
     assert "everybody who reaches http://0.0.0.0:" in caplog.text
 
 
-def test_an_address_that_cannot_be_used_is_named_and_the_follower_ends(bare: Path) -> None:
-    follower = Follower(Reader.of(str(bare)), {}, 0)
+def test_an_address_that_cannot_be_used_is_named_and_the_follower_ends(still: Shown) -> None:
+    follower = Follower(Reader.of(str(still.bare)), {}, 0)
     with pytest.raises(InvalidInput) as told:
         WebServer("8080", "--web", follower)
     assert follower.closed.is_set()

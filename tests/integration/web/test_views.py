@@ -23,7 +23,7 @@ from demandops.web.follower import Follower
 from demandops.web.page_views import thing
 from rpds import HashTrieMap
 
-from tests.integration.web.conftest import Look, Shown, causes
+from tests.integration.web.conftest import Shown, causes
 from tests.integration.web.html import Page
 from tests.kit import plain_yaml
 from tests.kit.goals import put
@@ -32,17 +32,6 @@ from tests.kit.repo import GitRepo
 PAGES = plain_yaml.beside(__file__)
 DETECTION = "od-edge-vehicle00"
 IMAGE = "docker.io/rwthika/robotkube-object-detection:2025-04"
-
-
-@pytest.fixture
-def shown(still: Shown) -> Shown:
-    """The site that tests share, because these tests change nothing."""
-    return still
-
-
-@pytest.fixture
-def bare(still: Shown) -> Path:
-    return still.bare
 
 
 def with_health(follower: Follower, **named: Health) -> Source:
@@ -67,9 +56,9 @@ def changed(follower: Follower, **fields: Any) -> Source:
         ("back-off: CrashLoopBackOff", "the maintainer of appdefs/object-detection-fusion"),
     ],
 )
-def test_a_failing_release_names_who_can_mend_it(follower: Follower, reason: str, who: str) -> None:
+def test_a_failing_release_names_who_can_mend_it(still: Shown, reason: str, who: str) -> None:
     health = Health("reconciled", reason, "HelmRelease perception/od-edge-vehicle00", failing=True)
-    now = with_health(follower, od_edge_vehicle00=health)
+    now = with_health(still.follower, od_edge_vehicle00=health)
     (cause,) = causes(now)
     assert cause.who.startswith(who)
     assert cause.command == "kubectl -n perception describe helmrelease od-edge-vehicle00"
@@ -80,10 +69,10 @@ def test_a_failing_release_names_who_can_mend_it(follower: Follower, reason: str
     assert causes(now, "vehicle00") and not causes(now, "requester=vehicle01")
 
 
-def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
+def test_releases_with_one_reason_are_one_cause(still: Shown) -> None:
     away = Health("waiting", "cannot be read: it is away", "cluster c-its")
-    names = [name.replace("-", "_") for name in follower.newest.releases]
-    now = with_health(follower, **dict.fromkeys(names, away))
+    names = [name.replace("-", "_") for name in still.follower.newest.releases]
+    now = with_health(still.follower, **dict.fromkeys(names, away))
     (cause,) = causes(now)
     assert cause.kind == "waiting" and len(cause.releases) == len(names)
     assert cause.who == "the operator of cluster c-its"
@@ -91,38 +80,38 @@ def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
 
 
 def test_what_is_not_known_is_not_called_ready(
-    shown: Shown, follower: Follower, monkeypatch: pytest.MonkeyPatch
+    still: Shown, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source = follower.newest
+    source = still.follower.newest
     # the follower's thread may set its own newest source at any time
     monkeypatch.setattr(Follower, "newest", property(lambda self: source))
     unknown = ["Nothing in the state repo keeps an application from being ready"]
-    page = shown.look("/")
+    page = still.look("/")
     assert page.texts("h1") == unknown and "does not watch the clusters" in page.text
-    source = with_health(follower)
-    assert shown.look("/").texts("h1") == ["Everything is ready"]
-    assert shown.look("/", q="vehicle00").texts("h1") == ["Everything that matches is ready"]
+    source = with_health(still.follower)
+    assert still.look("/").texts("h1") == ["Everything is ready"]
+    assert still.look("/", q="vehicle00").texts("h1") == ["Everything that matches is ready"]
     source = replace(source, watched=frozenset({"other"}))
-    page = shown.look("/")
+    page = still.look("/")
     assert page.texts("h1") == unknown and "Whether pods run on c-its is unknown" in page.text
 
 
 @pytest.mark.parametrize("case", PAGES)
-def test_a_page_shows(look: Look, case: str) -> None:
+def test_a_page_shows(still: Shown, case: str) -> None:
     wanted = PAGES[case]
-    page = look(wanted["path"], wanted.get("status", 200), **wanted.get("asks", {}))
+    page = still.look(wanted["path"], wanted.get("status", 200), **wanted.get("asks", {}))
     assert page.texts("h1")[0].startswith(wanted.get("h1", ""))
-    (shown,) = page.texts("body")
-    assert [text for text in wanted.get("has", ()) if text not in shown] == []
-    assert [text for text in wanted.get("lacks", ()) if text in shown] == []
+    (body,) = page.texts("body")
+    assert [text for text in wanted.get("has", ()) if text not in body] == []
+    assert [text for text in wanted.get("lacks", ()) if text in body] == []
     rows = [text.split()[0] for text in page.texts("tr")[1:]]
     assert wanted.get("rows", rows) == rows
 
 
-def test_an_old_bootstrap_file_and_an_object_of_no_release_are_causes(follower: Follower) -> None:
+def test_an_old_bootstrap_file_and_an_object_of_no_release_are_causes(still: Shown) -> None:
     old = OldBootstrap("c-its", "bootstrap/c-its.yaml", ("perception",), "git show …")
     left = Orphan("c-its", "Deployment", "perception", "mqtt-gone")
-    now = replace(follower.newest, old_bootstraps=(old,), orphans=(left,))
+    now = replace(still.follower.newest, old_bootstraps=(old,), orphans=(left,))
     told = {cause.what: cause for cause in causes(now)}
     assert told.keys() == {"bootstrap/c-its.yaml", "Deployment perception/mqtt-gone"}
     assert told["bootstrap/c-its.yaml"].command == old.command
@@ -135,22 +124,22 @@ def test_the_last_page_has_the_rest() -> None:
     assert page_of((), 0, 2) == ((), 1, 1)
 
 
-def test_a_release_is_explained(look: Look, state: GitRepo) -> None:
-    page = look("/release", name=DETECTION)
+def test_a_release_is_explained(still: Shown) -> None:
+    page = still.look("/release", name=DETECTION)
     assert "station00, vehicle00" in page.text
     file = f"clusters/c-its/perception/edge/{DETECTION}.yaml"
-    rendered = state.files("clusters/")[file]
-    difference, shown = [e.text for e in page.all("pre") if "kind: HelmRelease" in e.text]
-    assert shown == rendered
+    rendered = GitRepo(still.bare).files("clusters/")[file]
+    difference, whole = [e.text for e in page.all("pre") if "kind: HelmRelease" in e.text]
+    assert whole == rendered
     assert difference.splitlines()[1:] == [f"+{line}" for line in rendered.splitlines()]
     assert "started" in page.texts("td")
     assert "With it, the release starts." in page.text
-    changed = look("/release", name="of-edge-object-detection-fusion-cf7e0180a8bb")
+    changed = still.look("/release", name="of-edge-object-detection-fusion-cf7e0180a8bb")
     assert "With it, the release reconfigures." in changed.text
 
 
-def test_a_filter_lights_what_a_demand_holds(follower: Follower) -> None:
-    now = follower.newest
+def test_a_filter_lights_what_a_demand_holds(still: Shown) -> None:
+    now = still.follower.newest
     demand = next(one.demand for one in now.state.ledger if "vehicle01" in one.requesters)
     wide, _ = fleet_map.picture(now, Filter(f"demand={demand}"), "")["drawings"]
     lit = [card for card in wide.cards if card.is_lit]
@@ -174,12 +163,12 @@ def fleet_of(follower: Follower, vehicles: int, edges: int = 1) -> Source:
     return changed(follower, config=replace(config, nodes=more))
 
 
-def test_nodes_are_drawn_where_they_are_and_cover_no_other(follower: Follower) -> None:
-    newest, nodes = follower.newest, {}
+def test_nodes_are_drawn_where_they_are_and_cover_no_other(still: Shown) -> None:
+    newest, nodes = still.follower.newest, {}
     for number, node in enumerate(newest.config.nodes.values()):
         place = {"x": 10.0 * (number % 3), "y": float(number)}
         nodes[node.id] = node.model_copy(update={"position": Position.model_validate(place)})
-    source = changed(follower, config=replace(newest.config, nodes=nodes))
+    source = changed(still.follower, config=replace(newest.config, nodes=nodes))
     drawn = fleet_map.picture(source, Filter(""), "")
     assert (drawn["layout"], drawn["layouts"]) == ("place", ("cluster", "place"))
     for layout in drawn["layouts"]:
@@ -196,8 +185,8 @@ def cover(one: fleet_map.Card, other: fleet_map.Card) -> bool:
     return not (beside or one.y + one.height <= other.y or other.y + other.height <= one.y)
 
 
-def test_many_nodes_are_drawn_as_stacks_that_a_filter_opens(follower: Follower) -> None:
-    source = fleet_of(follower, 1000)
+def test_many_nodes_are_drawn_as_stacks_that_a_filter_opens(still: Shown) -> None:
+    source = fleet_of(still.follower, 1000)
     for drawing in fleet_map.picture(source, Filter(""), "")["drawings"]:
         assert sum(len(card.nodes) for card in drawing.cards) == len(source.config.nodes)
         (stack,) = [card for card in drawing.cards if len(card.nodes) >= 1000]
@@ -212,10 +201,8 @@ def test_many_nodes_are_drawn_as_stacks_that_a_filter_opens(follower: Follower) 
 
 @pytest.mark.parametrize("query", ["", "edge", "vehicle01"])
 @pytest.mark.parametrize(("vehicles", "edges"), [(0, 0), (25, 20), (200, 20)])
-def test_no_line_runs_behind_a_card(
-    follower: Follower, vehicles: int, edges: int, query: str
-) -> None:
-    source = fleet_of(follower, vehicles, edges)
+def test_no_line_runs_behind_a_card(still: Shown, vehicles: int, edges: int, query: str) -> None:
+    source = fleet_of(still.follower, vehicles, edges)
     for drawing in fleet_map.picture(source, Filter(query), "cluster")["drawings"]:
         assert drawing.lines
         for line in drawing.lines:
@@ -247,12 +234,12 @@ def points(path: str) -> list[tuple[float, float]]:
     return found
 
 
-def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
-    newest = follower.newest
+def test_a_demand_that_waits_for_room_is_listed(still: Shown) -> None:
+    newest = still.follower.newest
     since = newest.now - timedelta(minutes=5)
     waiting = WaitingDemand(read_goal(put("later", "vehicle02")), since)
     ledger = replace(newest.state.ledger, waiting=HashTrieMap({"later": waiting}))
-    now = changed(follower, ledger=ledger)
+    now = changed(still.follower, ledger=ledger)
     (cause,) = causes(now, "vehicle02")
     assert (cause.kind, cause.what, cause.since) == ("waiting", "later", since)
     assert cause.why == "waits for room on a node"
@@ -261,23 +248,23 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     assert thing(now, "later", "demand", ())["word"] == "waiting"
 
 
-def test_a_span_of_the_time_line_lists_only_its_events(look: Look) -> None:
+def test_a_span_of_the_time_line_lists_only_its_events(still: Shown) -> None:
     def commits(page: Page) -> list[str]:
         return [text.split()[-1] for text in page.texts("tr")[1:]]
 
-    everything = look("/timeline", span="all")
+    everything = still.look("/timeline", span="all")
     assert len(commits(everything)) == 3 and "Create the state repo" in everything.text  # long ago
-    page = look("/timeline", span="15min")
+    page = still.look("/timeline", span="15min")
     assert commits(page) == commits(everything)[:2]
     assert "2 events in the last 15min" in page.text
     dots = [title for title in page.texts("title") if " UTC, " in title]
     more = [int(count) for title in dots for count in re.findall(r"and (\d+) more", title)]
     assert len(dots) + sum(more) == 2  # the drawing has the same events as the list
-    assert len(commits(look("/timeline", span="7d", q="who:vehicle01"))) == 1
+    assert len(commits(still.look("/timeline", span="7d", q="who:vehicle01"))) == 1
 
 
-def test_the_time_line_fills_the_drawing(shown: Shown) -> None:
-    follower = shown.follower
+def test_the_time_line_fills_the_drawing(still: Shown) -> None:
+    follower = still.follower
     events = follower.history
     strip = time_line.strip(events, events[0].time, "all", None)
     template = (Path(time_line.__file__).parent / "pages" / "timeline.html.j2").read_text()
