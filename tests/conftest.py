@@ -187,6 +187,15 @@ def checkout(_checkout_template: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(_checkout_template, tmp_path / "state-repo"))
 
 
+@pytest.fixture(scope="session")
+def ros_domain() -> Iterator[int]:
+    """A ROS domain for nodes that serve only one test at a time; no other node answers in it."""
+    from tests.kit.ros import reserved  # only tests of ROS need rclpy
+
+    with reserved() as domain:
+        yield domain
+
+
 # ---- the program ----
 
 

@@ -14,7 +14,7 @@ from demandops.base.ros_parameters import flat_parameters
 from demandops.base.runtime import REAL
 from demandops.cluster.watches import ConfigMapWatch
 from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterEvent, ParameterValue
+from rcl_interfaces.msg import ParameterEvent
 from rcl_interfaces.srv import GetParameters, GetParameterTypes, SetParametersAtomically
 from rclpy.logging import get_logger
 from rclpy.node import Node
@@ -166,10 +166,10 @@ class ParameterSetter:
 
             def take_values(response: Any) -> None:  # noqa: ANN401
                 if len(response.values) == len(asked):
-                    had = dict.fromkeys(new, ParameterValue())
-                    had |= dict(zip(asked, response.values, strict=True))
-                    noted = (ParameterMessage(name=name, value=had[name]) for name in had)
-                    self._remember(before | {each.name: each for each in noted})
+                    noted = {name: ParameterMessage(name=name) for name in new}
+                    for name, value in zip(asked, response.values, strict=True):
+                        noted[name].value = value
+                    self._remember(before | noted)
                 parameters = [
                     as_the_node_has_it(name, value, kinds[name]).to_parameter_msg()
                     for name, value in wanted.items()

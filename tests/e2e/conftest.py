@@ -22,7 +22,7 @@ from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.kube import Manifest, build_manifest
 from tests.e2e.rig.tools import Report
 from tests.kit.limits import PATIENCE_S
-from tests.kit.ros import Client, reserved
+from tests.kit.ros import Client
 
 MakeWorld = Callable[[], World]
 SlipIn = Callable[..., None]
@@ -76,12 +76,6 @@ def rig(gitops: Gitops, tmp_path_factory: pytest.TempPathFactory, say: Report) -
     folder = tmp_path_factory.mktemp(f"rig-{gitops}")
     with Rig(CLUSTER, folder, gitops=gitops, nodes=NODES, report=say) as rig:
         yield rig
-
-
-@pytest.fixture(scope="session")
-def ros_domain() -> Iterator[int]:
-    with reserved() as domain:
-        yield domain
 
 
 @pytest.fixture(scope="session")

@@ -125,7 +125,6 @@ def test_what_cannot_become_ready_is_reported_in_time_with_the_reason(
 def test_a_refusal_of_the_controller_is_reported_with_its_reason(
     world: World, requester: DemandClient
 ) -> None:
-    """The answer names the release that cannot be installed, and the controller's reason."""
     restart_generator(world, SHORT_S)
     broken = raised(world, "object-detection")
     broken[DETECTION_TEMPLATE] = world.file(DETECTION_TEMPLATE) + '{{ fail "no lidar here" }}\n'

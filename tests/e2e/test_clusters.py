@@ -95,7 +95,6 @@ def pulls(world: World, fleet: Rig) -> int:
 
 
 def applied_since(domain: FluxDomain, commit: str) -> list[str]:
-    """Return the commits that the Kustomization has applied since a commit, newest first."""
     history = domain.get("Kustomization", domain.name)["status"]["history"]
     commits = [entry["metadata"]["revision"].rpartition(":")[2] for entry in history]
     return commits[: commits.index(commit)]

@@ -97,7 +97,6 @@ def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
 
 
 def pushes(url: str) -> bool:
-    """Return whether a process of this machine pushes to this URL."""
     commands = [path.read_bytes() for path in Path("/proc").glob("[0-9]*/cmdline")]
     return any(b"push" in line and url.encode() in line for line in commands)
 

@@ -36,7 +36,6 @@ def test_a_service_that_cannot_start_is_reconfigured_and_removed(
 
 
 def requested_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
-    """Return a copy of the goal whose requesters are ``vehicle`` and station00."""
     requesters = {"requester_ids": [vehicle, "station00"]}
     apps = [
         app | {"object_detection_fusion_app": app["object_detection_fusion_app"] | requesters}

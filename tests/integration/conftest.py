@@ -12,8 +12,6 @@ from tests.kit.repo import GitRepo
 
 
 class On:
-    """Runs commands with ``--state-repo``."""
-
     def __init__(self, demandops: Run, state: GitRepo) -> None:
         self._run, self.state = demandops, state
 
@@ -34,7 +32,6 @@ class On:
         return ran.err
 
     def request(self, *goals: object, more: tuple[Any, ...] = ()) -> Ran:
-        """Send goals through ``demandops request --output json``."""
         text = yaml.safe_dump_all(goals, sort_keys=False, allow_unicode=True)
         return self("request", "-", "--output", "json", *more, stdin=text)
 

@@ -38,8 +38,6 @@ def test_a_fault_of_the_program_or_its_machine_has_a_code_of_its_own(
 
 
 class TestProcess:
-    """The command as a process of its own."""
-
     def run(self, *args: str, **environment: str) -> Ran:
         return process(*PROGRAM, *args, env=os.environ | environment)
 

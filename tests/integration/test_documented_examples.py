@@ -62,7 +62,6 @@ def with_nodes(listed: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def with_services(services: dict[str, Any]) -> dict[str, str]:
-    """Return the definition of the application with more fields in its services."""
     definition = yaml.safe_load(configuration()[APPDEF])
     for name, more in services.items():
         definition["services"][name] |= more

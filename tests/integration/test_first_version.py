@@ -11,15 +11,22 @@ import yaml
 from demandops.base.settings import LEDGER_API_VERSION
 
 from tests.integration.conftest import On
-from tests.kit.repo import GitRepo, first_version, git
+from tests.kit.repo import GitRepo, git
 
 EXPERIMENT = Path(__file__).parents[2] / "examples" / "experiment"
+BUNDLE = Path(__file__).parents[1] / "fixtures" / "first-version.bundle"
 BOOTSTRAP = "bootstrap/c-its.yaml"
 
 
 @pytest.fixture
 def state(tmp_path: Path) -> GitRepo:
-    return first_version(tmp_path / "state.git")
+    """The first version's: render version 1, ``demandops.ledger/v1``.
+
+    It has the experiment's first three joins, two overrides (one of them has ended), a fourth join,
+    a demand with a lease, and a shutdown.
+    """
+    git(tmp_path, "clone", "--quiet", "--bare", str(BUNDLE), "state.git")
+    return GitRepo(tmp_path / "state.git")
 
 
 def documents(files: dict[str, str]) -> dict[str, Any]:
@@ -32,7 +39,6 @@ def documents(files: dict[str, str]) -> dict[str, Any]:
 
 
 def with_todays_topics(text: str) -> str:
-    """Return a manifest in which the output topics of a fusion have their present names."""
     return re.sub(r" /(edge|cloud)/(\w+_(?:raw_objects|global_\w+))$", r" /\1_\2", text, flags=re.M)
 
 

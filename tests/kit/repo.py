@@ -148,11 +148,15 @@ class Person:
         self._git("reset", "--quiet", "--hard", "origin/main")
 
     def write(self, files: Mapping[str, str | None]) -> None:
-        """Write ``files`` into the clone on top of main, without a commit."""
+        """Write or remove files in the clone on top of main, without a commit."""
         self.fetch()
         for path, text in files.items():
-            (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
-            (self.folder / path).write_text(str(text))
+            target = self.folder / path
+            if text is None:
+                target.unlink()
+            else:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_text(text)
 
     def read(self, path: str) -> str:
         return GitRepo(Path(self.bare)).files()[path]
@@ -172,14 +176,7 @@ class Person:
 
     def push(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
         """Commit and push from the clone; this fails if somebody else pushes meanwhile."""
-        self.fetch()
-        for path, text in files.items():
-            target = self.folder / path
-            if text is None:
-                target.unlink()
-            else:
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_text(text)
+        self.write(files)
         self._git("add", "--all")
         self._git("commit", "--quiet", "--message", message)
         self._push()
@@ -372,20 +369,6 @@ def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
     assert sorted(ids) == sorted(set(ids)), sorted(one for one in ids if ids.count(one) > 1)
     before = made[-verify_last - 1].id if 0 < verify_last < len(made) else None
     assert differing(repo, before) == {}
-
-
-FIRST_VERSION = Path(__file__).parents[1] / "fixtures" / "first-version.bundle"
-"""The bundle of a state repo from the first version: render version 1, ``demandops.ledger/v1``.
-
-The repo has the experiment's first three joins (tag ``three-joins``), two overrides (one of them
-has ended), a fourth join, a demand with a lease, and a shutdown.
-"""
-
-
-def first_version(path: Path, revision: str = "main") -> GitRepo:
-    git(path.parent, "clone", "--quiet", "--bare", str(FIRST_VERSION), str(path))
-    git(path, "update-ref", "refs/heads/main", f"{revision}^{{commit}}")
-    return GitRepo(path)
 
 
 # ---- forced writes to disk ----

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,7 +13,6 @@ from tests.kit.cli import Run, process
 from tests.kit.detection import rule, text_of
 from tests.kit.limits import LONGEST_TEST_S
 from tests.kit.live import DEFINITIONS, Step, heard_live, told
-from tests.kit.ros import reserved
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = plain_yaml.beside(__file__, "messages")
@@ -48,16 +46,10 @@ def rules(tmp_path: Path) -> Path:
     return file
 
 
-@pytest.fixture
-def domain() -> Iterator[int]:
-    with reserved() as reservation:
-        yield reservation
-
-
 def test_built_messages_give_the_same_events_live_and_from_a_bag(
-    python: Path, domain: int, rules: Path, demandops: Run
+    python: Path, ros_domain: int, rules: Path, demandops: Run
 ) -> None:
-    log = heard_live(rules, STEPS, len(TABLE["events"]), domain, str(python))
+    log = heard_live(rules, STEPS, len(TABLE["events"]), ros_domain, str(python))
     assert sorted(told(log)) == sorted(TABLE["events"])
     assert "a message on /hazards is left out: the message has no field causes[0].code" in log
     # a bag has its definitions, so a replay needs no package

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
-import yaml
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
@@ -92,7 +91,7 @@ def story(bare: Path, folder: Path) -> Iterator[Story]:
         generator = Generator(str(bare), fetch_interval=0.2)
         stack.callback(generator.close)
         person = Person(bare, folder / "person")
-        book(generator, *(yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT[:4]))
+        book(generator, *map(goals.experiment, (1, 2, 3, 4)))
         book(generator, leased("vehicle01-to-cloud", "vehicle01"))
         access = ClusterAccess(kubeconfig=kubeconfig(folder, api.url))
         follower = Follower(Reader.of(str(bare)), {"c-its": access}, 0)

@@ -16,13 +16,6 @@ from tests.kit.ros import Client, Serve, Served, Servers, reserved
 from tests.scenarios import running
 
 
-@pytest.fixture(scope="session")
-def ros_domain() -> Iterator[int]:
-    """A ROS domain for nodes that serve only one test; no other node answers in it."""
-    with reserved() as domain:
-        yield domain
-
-
 @pytest.fixture
 def servers(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Servers]:
     """Starts commands that use ROS; commands that still run at the end of the test are killed."""

@@ -7,14 +7,9 @@ out here. An object exists if its row of `examples/experiment/paper.py` has requ
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from pathlib import Path
-from typing import Any
-
-import yaml
 
 from examples.experiment import paper
-
-EXPERIMENT = Path(__file__).resolve().parents[3] / "examples" / "experiment"
+from tests.kit.goals import experiment as demand  # noqa: F401 - tests take it from here
 
 CLUSTER = "c-its"
 """The cluster of the skeleton."""
@@ -37,12 +32,6 @@ _ENDS = {
 
 # One is from `_domain.yaml`; Kubernetes adds the other to every namespace.
 WITHOUT_DEMANDS = frozenset({"ConfigMap demandops-domain", "ConfigMap kube-root-ca.crt"})
-
-
-def demand(step: int) -> dict[str, Any]:
-    (file,) = EXPERIMENT.glob(f"{step}-*.yaml")
-    goal: dict[str, Any] = yaml.safe_load(file.read_text())
-    return goal
 
 
 def source_end(node: str) -> str:

@@ -162,7 +162,6 @@ class World:
         return sent
 
     def step(self, number: int, wanted: frozenset[str]) -> None:
-        """Send the goal of a step, and `follow` it."""
         self.follow(self.demand(demand(number)), wanted)
 
     def follow(self, sent: Sent, wanted: frozenset[str]) -> None:

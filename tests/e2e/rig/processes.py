@@ -146,13 +146,11 @@ class Processes:
 
 
 def _signal(process: subprocess.Popen[bytes], *numbers: signal.Signals) -> None:
-    """Send signals to a process and to its children."""
     for number in numbers:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill what is left of a process and of its children."""
     _signal(process, signal.SIGKILL)
     process.wait()

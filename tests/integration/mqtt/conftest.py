@@ -41,7 +41,6 @@ class Broker:
     authority: Path
 
     def inventory(self) -> str:
-        """Return the text of an ``inventory/brokers.yaml`` with this broker."""
         entry = {
             "node": "edge",
             "host": "127.0.0.1",
@@ -189,7 +188,6 @@ class Client:
         assert sent.is_published()
 
     def ready(self) -> None:
-        """Wait until the broker has confirmed every subscription."""
         topics = self.parameters.get("bridge.mqtt2ros.mqtt_topics", [])
         wait_until(lambda: len(self.acknowledged) == len(topics), "all is subscribed to")
 

@@ -35,14 +35,12 @@ def clock() -> Clock:
 
 @pytest.fixture
 def server(bare: Path) -> Iterator[Server]:
-    """A Git server of the state repo; a test can set its faults."""
     with serving(bare.parent) as running:
         yield running
 
 
 @pytest.fixture
 def http(server: Server) -> str:
-    """The URL of the state repo at `server`."""
     return f"{server.url}/state.git"
 
 

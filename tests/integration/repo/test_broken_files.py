@@ -33,13 +33,11 @@ TWO = override({"services": ["object-detection"], "nodes": ["edge"]}, replicas=2
 
 
 def values(bare: Path) -> tuple[str, int]:
-    """Return the image's tag and the replicas of the detection."""
     found = yaml.safe_load(text(bare, DETECTION))["spec"]["values"]
     return found["image"]["tag"], found["replicas"]
 
 
 def tagged(bare: Path, new: str, kind: str = "Images") -> str:
-    """Return registry/images.yaml with another tag for the detection's image."""
     images = yaml.safe_load(text(bare, IMAGES)) | {"kind": kind}
     images["images"]["object-detection"]["tag"] = new
     return yaml.safe_dump(images)

@@ -39,12 +39,10 @@ class Probe:
         return subprocess.run(self._command, check=False).returncode == 0
 
     def make_old(self) -> None:
-        """Let the file be as old as if an hour had passed."""
         an_hour_ago = self.file.stat().st_mtime - 3600
         os.utime(self.file, (an_hour_ago, an_hour_ago))
 
     def wait(self) -> None:
-        """Wait until the worker touches the file."""
         wait_until(self.file.exists, "the worker touched the file")
         self.make_old()
         wait_until(self.passes, "the worker touches the file again")

@@ -76,7 +76,6 @@ def test_two_processes_on_one_machine_lose_and_double_nothing(
 
 
 def keep_pushing(person: Person, over: threading.Event, pushed: list[str]) -> None:
-    """Change the state repo again and again; repeat each push until it is accepted."""
     dice = random.Random(SEED)
     for number in count(1):
         if over.wait(dice.uniform(*PERSONS_PAUSE_S)):

@@ -31,7 +31,6 @@ def short_digests(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def rival(id: str, name_of: Callable[[str], str]) -> str:
-    """Return another id with the same name."""
     others = (f"{id}/{'-' * number}" for number in count(1))
     return next(other for other in others if name_of(other) == name_of(id))
 

@@ -179,7 +179,6 @@ class Story:
         self._clock.pass_(seconds)
 
     def is_set(self, seconds: float) -> None:
-        """Set the clock forward or back."""
         self._clock.set_by(seconds)
 
     # ---- demands ----
@@ -196,7 +195,6 @@ class Story:
             self._sent[name] = Proposed(self._generator, demand(told), f"op-{name}")
 
     def roll_back(self, what: Mapping[str, Any]) -> None:
-        """Send a rollback ``to`` a commit that was noted."""
         who, to = ("A", "a@example.org"), self._noted[what["to"]]
         goal = demand_goals.rollback(to, drop_newer=what["drop_newer"], reason="x", who=who)
         assert rig.outcome(self._generator.submit(goal)) == what["gives"]
@@ -333,11 +331,9 @@ class Story:
             self.change(commit["files"], **how)
 
     def commit(self, commit: Mapping[str, Any]) -> None:
-        """Commit files, as `change`, with this message."""
         self.change(commit["files"], message=commit["message"])
 
     def undo(self, last: str) -> None:
-        """Undo the last change."""
         assert last == "change"
         self.change(self._before)
 
@@ -353,7 +349,6 @@ class Story:
             self.change({path: text}, **commit)
 
     def edit_waiting(self, texts: Mapping[str, Any]) -> None:
-        """Change the files of demands that wait for room."""
         self.change({waiting_path(name): text for name, text in texts.items()})
 
     def claim_by_hand(self, claims: Mapping[str, Mapping[str, Any]]) -> None:
@@ -374,7 +369,6 @@ class Story:
         self.change(dict.fromkeys(rig.claims(self._bare, word)))
 
     def reset(self, name: str) -> None:
-        """Set main to a commit that was noted."""
         rig.git(self._bare, "update-ref", "refs/heads/main", self._noted[name])
 
     def policy(self, changed: Mapping[str, Any]) -> None:
@@ -390,7 +384,6 @@ class Story:
         self.git([["reflog", "expire", "--expire=now", "--all"], ["gc", "-q", "--prune=now"]])
 
     def git(self, commands: list[list[str]]) -> None:
-        """Run git in the state repo, as an operator."""
         for command in commands:
             rig.git(self._bare, *command)
 
@@ -404,7 +397,6 @@ class Story:
                 file.write_text(text) if text is not None else file.unlink()
 
     def loses(self, spec: str) -> None:
-        """Let the disk of the state repo lose an object."""
         rig.lose(self._bare, spec)
 
     def clone_loses(self, path: str) -> None:
@@ -421,7 +413,6 @@ class Story:
             Generator(str(self._bare))
 
     def http(self, faults: Mapping[str, Any]) -> None:
-        """Set faults of the smart-HTTP server."""
         for name, value in faults.items():
             setattr(self._server.faults, name, value)
 
@@ -536,14 +527,6 @@ class Story:
         assert {f for f in files if any(one.startswith(f) for one in found)} == {*files}, found
         assert all(one.startswith((*files,)) for one in found), found
 
-    def problems_soon(self, files: list[str]) -> None:
-        self.waits_until({"problems": files})
-
-    def said(self, words: list[str]) -> None:
-        """Check words of the message of the newest commit."""
-        text = rig.git(self._bare, "log", "-1", "--format=%B", "main")
-        assert [word for word in words if word not in text] == [], text
-
     def check_tells(self, files: list[str]) -> None:
         """Check in which files `demandops check` finds faults once the last change is merged."""
         self._person.fetch()
@@ -566,7 +549,6 @@ class Story:
             rig.wait_until(lambda: word in why() and bool(word) == bool(why()), word)  # noqa: B023
 
     def pushes(self, count: int) -> None:
-        """Check how many pushes the smart-HTTP server has taken."""
         assert self._server.taken == count
 
     def requests_refused(self, count: int) -> None:

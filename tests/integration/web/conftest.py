@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import yaml
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.views.causes import Cause
@@ -58,7 +57,7 @@ class Shown:
 @contextmanager
 def showing(bare: Path) -> Iterator[Shown]:
     with running(bare) as generator:
-        book(generator, *(yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT[:2]))
+        book(generator, *map(goals.experiment, (1, 2)))
         follower = Follower(Reader.of(str(bare)), {}, 0)
         site = Site(follower, ("127.0.0.1", "localhost"))
         client = TestClient(site.application, base_url="http://127.0.0.1:8080")

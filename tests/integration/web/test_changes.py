@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import yaml
 from demandops.cli.main import run
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
@@ -65,7 +64,7 @@ def test_a_denied_connection_is_told_everywhere(shown: Shown, person: Person) ->
         "0 waiting",
         "2 changes in the last hour 2 booked, 0 released in the last day",
     ]
-    book(shown.generator, yaml.safe_load(goals.EXPERIMENT[0].read_text()) | {"shutdown": True})
+    book(shown.generator, goals.experiment(1) | {"shutdown": True})
     person.override(roadworks=DENY)
     person.change({"README.md": "hello"}, "Greet")
     overridden(shown.generator)
@@ -109,7 +108,7 @@ def test_an_application_that_others_demand_too_runs_on_without_a_suspended_reque
 
 def test_an_override_that_no_generator_carried_out_yet_is_told(bare: Path, state: GitRepo) -> None:
     with running(bare) as generator:
-        book(generator, *(yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT[:2]))
+        book(generator, *map(goals.experiment, (1, 2)))
     state.commit({"overrides/roadworks.yaml": DENY})
     follower = Follower(Reader.of(str(bare)), {}, 0)
     client = TestClient(Site(follower, ("127.0.0.1",)).application, base_url="http://127.0.0.1")
@@ -210,7 +209,7 @@ def test_views_derived_step_by_step_equal_views_derived_from_scratch(
     text = person.read(appdef).replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")
     person.change({appdef: text}, "Scale")
     wait_until(lambda: shown.follower.newest.config.files[appdef] == text, "it is shown")
-    joins = [yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT]
+    joins = [*map(goals.experiment, range(1, 9))]
     another = copy.deepcopy(joins[0]) | {"connections": []}
     another["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station01"]
     for goal in (joins[2], another, another | {"shutdown": True}, *joins[3:]):
