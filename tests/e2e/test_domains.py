@@ -121,25 +121,11 @@ def unlimited_project(rig: Rig) -> Iterator[None]:
 
 
 @pytest.mark.only("argocd", "a release of Flux has an account, but no project")
-@pytest.mark.parametrize(
-    ("kind", "project", "namespace", "reason"),
-    [
-        ("Application", "default", "perception", "to use project"),
-        ("Application", "demandops-perception", "perception", "do not match"),
-        ("Application", "default", CONTROL, "namespace argocd is not permitted"),
-        ("AppProject", None, "perception", "AppProject is not permitted in project"),
-    ],
-    ids=["another project", "another namespace", "in Argo CD's own namespace", "a project"],
-)
+@pytest.mark.parametrize("release", TABLES["releases"])
 def test_a_release_cannot_leave_its_namespace(
-    world: World,
-    slip_in: SlipIn,
-    unlimited_project: None,
-    kind: str,
-    project: str | None,
-    namespace: str,
-    reason: str,
+    world: World, slip_in: SlipIn, unlimited_project: None, release: str
 ) -> None:
+    kind, project, namespace, reason = TABLES["releases"][release]
     domain, spec = world.domain, {}
     if project:
         spec = {"project": project, **TABLES["application"]}

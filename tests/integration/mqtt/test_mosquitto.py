@@ -16,23 +16,14 @@ import pytest
 
 from tests.e2e.rig import pki
 from tests.integration.mqtt.conftest import PASSWORD, USER, Broker, Client, Pod
-from tests.kit.connections import routes
+from tests.kit.connections import demand, routes
 from tests.kit.memory import MemoryRepo
 from tests.kit.rig import wait_until
 
-DEMAND: dict[str, Any] = {
-    "connections": [
-        {
-            "id": "vehicle00/edge",
-            "source": "vehicle00",
-            "target": "edge",
-            "topics": {
-                "/position": {"target": "/fleet/position", "qos": 1, "retained": True},
-                "/speed": "/fleet/speed",
-                "/warnings": {"target": "/fleet/warnings", "reverse": True, "qos": 2},
-            },
-        }
-    ]
+TOPICS = {
+    "/position": {"target": "/fleet/position", "qos": 1, "retained": True},
+    "/speed": "/fleet/speed",
+    "/warnings": {"target": "/fleet/warnings", "reverse": True, "qos": 2},
 }
 
 Ends = dict[str, Pod]
@@ -40,7 +31,9 @@ Ends = dict[str, Pod]
 
 @pytest.fixture(scope="module")
 def pods(broker: Broker, tmp_path_factory: pytest.TempPathFactory) -> Ends:
-    made = MemoryRepo({"inventory/brokers.yaml": broker.inventory()}).decide(routes(DEMAND))
+    made = MemoryRepo({"inventory/brokers.yaml": broker.inventory()}).decide(
+        routes(demand("mqtt", TOPICS, id="vehicle00/edge"))
+    )
     manifests = {
         side: text
         for path, text in made.files.items()

@@ -211,17 +211,8 @@ def test_a_persons_settings_for_git_do_not_reach_the_generators_git(
     home.mkdir()
     for name in ("pre-push", "reference-transaction"):
         rig.hook(tmp_path / "template", name, "echo no >&2; exit 1")
-    settings = {
-        "core": f"hooksPath = {hooks}",
-        "init": f"templateDir = {hooks.parent}",
-        "push": "gpgSign = true\n pushOption = ci.skip\n recurseSubmodules = only",
-        'remote "origin"': "mirror = true\n pushurl = /nowhere",
-        "fetch": "prune = true",
-        "color": "ui = always",
-        "safe": "bareRepository = explicit",
-        "alias": "push = !false",
-    }
-    (home / ".gitconfig").write_text("".join(f"[{k}]\n {v}\n" for k, v in settings.items()))
+    settings = TABLES["settings"].replace("TEMPLATE", str(hooks.parent))
+    (home / ".gitconfig").write_text(settings)
     (tmp_path / "demand.yaml").write_text(yaml.safe_dump(goals.put("d", "user")))
     environment = {key: text for key, text in os.environ.items() if key != "GIT_CONFIG_GLOBAL"}
     environment["HOME"] = str(home)

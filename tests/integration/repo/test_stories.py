@@ -527,9 +527,6 @@ class Story:
         assert {f for f in files if any(one.startswith(f) for one in found)} == {*files}, found
         assert all(one.startswith((*files,)) for one in found), found
 
-    def problems_soon(self, files: list[str]) -> None:
-        self.waits_until({"problems": files})
-
     def check_tells(self, files: list[str]) -> None:
         """Check in which files `demandops check` finds faults once the last change is merged."""
         self._person.fetch()
