@@ -20,7 +20,6 @@ from demandops.model.release import ServiceKey
 
 from tests.kit import plain_yaml
 from tests.kit.config import edited, override, skeleton
-from tests.kit.goals import CLOUD
 from tests.kit.memory import NOW, MemoryRepo
 from tests.scenarios.running import configuration
 
@@ -42,15 +41,10 @@ def test_no_python_of_the_generator_knows_it() -> None:
 def merged(name: str, given: list[object]) -> object:
     """Return what the recorder gets if demands, one after the other, give these values."""
     repo = MemoryRepo(ADDITIONS)
-    cloud = {"point_cloud": [{"topic": CLOUD[0], "source": CLOUD[1]}]}
-    app = {"id": "edge/record", "type": "recorder", "node": "edge", "inputs": cloud}
     for minute, value in enumerate(given):
-        item: dict[str, Any] = app | {"parameters": {} if value is None else {name: value}}
-        demand = {"kind": "Demand", "demand": f"d{minute}", "requesters": [f"who{minute}"]}
-        repo.send(demand | {"applications": [item]}, NOW + timedelta(minutes=minute))
-    releases = repo.objects("HelmRelease").items()
-    (found,) = (one["spec"]["values"][name] for id, one in releases if id.startswith("rec-"))
-    return found
+        parameters = {} if value is None else {name: value}
+        repo.send(demand(f"d{minute}", **parameters), NOW + timedelta(minutes=minute))
+    return values(repo)[name]
 
 
 @pytest.mark.parametrize("case", plain_yaml.beside(__file__), ids=str)

@@ -41,11 +41,10 @@ class Origin(NamedTuple):
     """What a service can read: the topics of an input role, or the output of a service."""
 
     name: str
-    roots: frozenset[str]
-    """The input roles from which the topics are made; none for the kind ``once``."""
+    roots: frozenset[str]  # the input roles from which the topics are made; none for `once`
+    # `source`: topics at their sources; `topic`: one for each input topic, at the node of an
+    # application; `once`: one for an application, a node or a cluster
     kind: str
-    """``source``: topics at their sources; ``topic``: one for each input topic, at the node of an
-    application; ``once``: one for an application, a node or a cluster."""
 
 
 class Graphs:

@@ -9,15 +9,14 @@ import pytest
 import yaml
 from demandops.decide.booking import Drain
 from demandops.decide.placement.relocation import with_moves
-from demandops.model.demand.demand import Requirement
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger import records
 from demandops.model.ledger.records import WaitingDemand
 
 from tests.kit import plain_yaml
-from tests.kit.config import state_of
+from tests.kit.connections import state
 from tests.kit.goals import put
-from tests.kit.memory import NOW, MemoryRepo, rebuilt
+from tests.kit.memory import NOW, MemoryRepo
 
 
 @pytest.mark.parametrize("change", plain_yaml.beside(__file__), ids=str)
@@ -31,52 +30,39 @@ def test_a_file_that_a_person_broke_holds_nothing(change: dict[str, Any]) -> Non
 
 # ---- what leaves a drained node ----
 
-FREE = ("edge", "vehicle01")  # the nodes with a GPU, beside the drained node `cloud`
+GPU = {"capabilities": ["gpu"]}
 
 
 def on_cloud(count: int, *stuck: int) -> MemoryRepo:
-    """Return a repo with applications on the drained node ``cloud``; the ``stuck`` must stay."""
-    repo = MemoryRepo()
+    """Return a repo with applications on the drained node ``cloud``; the ``stuck`` must stay.
+
+    The others may run on each other node with a GPU, which are ``edge`` and ``vehicle01``.
+    """
+    repo = MemoryRepo(state=state(cloud=GPU))
     for number in range(count):
-        app = {
-            "id": f"app{number}",
-            "type": "object-detection-fusion",
-            "place": {"labels": ["node_id=cloud"]},
-            "inputs": {"ego_data": [{"topic": "/ego", "source": "cloud"}]},
-        }
-        goal = {"kind": "Demand", "demand": f"d{number}", "requesters": ["v"]}
-        repo.send(goal | {"applications": [app]})
-    gpu = Requirement(capabilities=("gpu",))
-    ledger = rebuilt(
-        one
-        if one.subject.id in [f"app{number}" for number in stuck]
-        else replace(one, held=replace(one.application, place=gpu))
-        for one in repo.state.ledger
-    )
-    nodes = {
-        id: node.model_copy(
-            update={"capabilities": ("gpu",) * (id in FREE), "drained": id == "cloud"}
-        )
-        for id, node in repo.config.nodes.items()
-    }
-    repo.state = state_of(replace(repo.config, nodes=nodes), ledger)
+        goal = put(f"d{number}", id=f"app{number}", topic=("/ego", "cloud"), node="")
+        place = {"labels": ["node_id=cloud"]} if number in stuck else GPU
+        goal["applications"][0]["place"] = place
+        repo.send(goal)
+    drained = state(cloud=GPU | {"drained": True}, edge=GPU, vehicle01=GPU)
+    repo.state = replace(drained, ledger=repo.state.ledger)
     return repo
 
 
 def test_what_leaves_a_node_is_spread_over_the_others() -> None:
     decision = on_cloud(4).decide(Drain(id="cloud"))
     assert len(decision.placed) == 4
-    assert dict(decision.state.ledger.applications_on) == dict.fromkeys(FREE, 2)
+    assert dict(decision.state.ledger.applications_on) == {"edge": 2, "vehicle01": 2}
 
 
 def test_a_drain_in_parts_moves_the_same_applications_and_skips_none() -> None:
-    state = on_cloud(5, 0, 3).state
-    whole = with_moves(Drain(id="cloud"), state, state.usage(), state.names())
+    there = on_cloud(5, 0, 3).state
+    whole = with_moves(Drain(id="cloud"), there, there.usage(), there.names())
     assert len(whole.moved) == 3 and len(whole.stays) == 2 and not whole.last
-    parts = [with_moves(Drain(id="cloud"), state, state.usage(), state.names(), most=2)]
+    parts = [with_moves(Drain(id="cloud"), there, there.usage(), there.names(), most=2)]
     while after := parts[-1].last:
         drain = Drain(id="cloud", after=after)
-        parts.append(with_moves(drain, state, state.usage(), state.names(), most=2))
+        parts.append(with_moves(drain, there, there.usage(), there.names(), most=2))
     assert len(parts) > 1
     stays = [text.split(",")[0] for part in parts for text in part.stays]
     assert stays == [text.split(",")[0] for text in whole.stays]

@@ -16,7 +16,9 @@ from tests.kit import plain_yaml
 from tests.kit.goals import application, connection, goal, perception
 from tests.kit.memory import MemoryRepo
 from tests.kit.plain_yaml import FAST
+from tests.unit.model.test_config_mistakes import changed
 
+DOMAINS = {"fleet", "city"}
 BUILT_IN = {"v1", "apps/v1", "rbac.authorization.k8s.io/v1"}
 
 
@@ -51,20 +53,15 @@ def test_requesters_appear_nowhere_below_clusters() -> None:
 
 
 def test_each_access_domain_has_its_own_folder_namespace_and_account() -> None:
-    text = "apiVersion: demandops/v1\nkind: AccessDomains\ndomains:\n"
-    for name in ("fleet", "city"):
-        text += f"  - {{name: {name}, namespace: ns-{name}, serviceAccount: sa-{name}, "
-        text += 'rules: [{name: all, peers: ["*"]}], nodes: ['
-        text += '"vehicle*"]}\n' if name == "fleet" else "edge, cloud, station00]}\n"
-    books = MemoryRepo({"policy/access-domains.yaml": text})
+    named = {f"namespace: {it}": f"namespace: ns-{it}, serviceAccount: sa-{it}" for it in DOMAINS}
+    books = MemoryRepo(changed({"base": "two domains", "policy/access-domains.yaml": named}))
     books.send(perception())
     for path, document in documents(books):
         domain = path.split("/")[2]
         assert document["metadata"]["namespace"] == f"ns-{domain}"
         account = document.get("spec", {}).get("serviceAccountName", f"sa-{domain}")
         assert account == f"sa-{domain}"
-    folders = {path.split("/")[2] for path, _ in documents(books)}
-    assert folders == {"fleet", "city"}
+    assert {path.split("/")[2] for path, _ in documents(books)} == DOMAINS
 
 
 @pytest.mark.parametrize("case", plain_yaml.beside(__file__), ids=itemgetter("is"))

@@ -28,12 +28,12 @@ from tests.kit.http import serving
 from tests.kit.memory import MemoryRepo
 
 
-def confine(code: str, *arguments: str, seconds: int = 60) -> subprocess.CompletedProcess[str]:
-    confined = [sys.executable, "-IS", confined_process.__file__, str(seconds)]
-    command = [*confined, sys.executable, "-c", code, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+def confine(*command: str, seconds: int = 60) -> subprocess.CompletedProcess[str]:
+    confined = [sys.executable, "-IS", confined_process.__file__, str(seconds), *command]
+    return subprocess.run(confined, capture_output=True, text=True, check=False)
 
 
+PYTHON = (sys.executable, "-c")
 SAID = plain_yaml.beside(__file__, "helm-says")
 Ran = Callable[[str], Report]
 FETCH = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout=5)"
@@ -41,12 +41,12 @@ FETCH = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout
 
 def test_it_reaches_no_network_where_the_kernel_lets_us_say_so() -> None:
     unshare = "import ctypes; raise SystemExit(ctypes.CDLL(None).unshare(0x50000000) and 9)"
-    if subprocess.run([sys.executable, "-c", unshare], check=False).returncode == 9:
+    if subprocess.run([*PYTHON, unshare], check=False).returncode == 9:
         pytest.skip("this kernel lets nobody make a network namespace")
     with serving() as server:
-        assert confine(FETCH, server.url).returncode == 1
+        assert confine(*PYTHON, FETCH, server.url).returncode == 1
         assert server.calls == []
-        subprocess.run([sys.executable, "-c", FETCH, server.url], check=True)
+        subprocess.run([*PYTHON, FETCH, server.url], check=True)
 
 
 @pytest.mark.parametrize(
@@ -54,13 +54,12 @@ def test_it_reaches_no_network_where_the_kernel_lets_us_say_so() -> None:
 )
 def test_it_has_only_so_much(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert confine(code, seconds=1).returncode != 0
+    assert confine(*PYTHON, code, seconds=1).returncode != 0
 
 
 def test_a_program_that_cannot_run_is_told() -> None:
-    command = [sys.executable, "-IS", confined_process.__file__, "1", "/nowhere/helm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.stderr == "Error: /nowhere/helm cannot be run: No such file or directory\n"
+    told = "Error: /nowhere/helm cannot be run: No such file or directory\n"
+    assert confine("/nowhere/helm", seconds=1).stderr == told
 
 
 @pytest.fixture

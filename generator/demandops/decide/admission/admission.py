@@ -141,7 +141,7 @@ def _definition_faults(  # noqa: PLR0912 - a branch for each fault
         yield fault(f"inputs.{role}", message)
     services = config.services[appdef.name]
     defined = {f"appdefs/{appdef.name}/appdef.yaml": appdef.parameters}
-    defined |= {service.file: service.parameters for service in services.values()}
+    defined |= {each.file: each.parameters for each in services.values() if each.parameters}
     for name, value in app.parameters.items():
         known = {file: own[name] for file, own in defined.items() if name in own}
         if not known:
