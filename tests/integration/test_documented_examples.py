@@ -61,13 +61,6 @@ def with_nodes(listed: list[dict[str, Any]]) -> dict[str, str]:
     return {NODES: yaml.safe_dump(inventory | {"nodes": [*nodes.values()]})}
 
 
-def with_services(services: dict[str, Any]) -> dict[str, str]:
-    definition = yaml.safe_load(configuration()[APPDEF])
-    for name, more in services.items():
-        definition["services"][name] |= more
-    return {APPDEF: yaml.safe_dump(definition)}
-
-
 def refusal(repo: MemoryRepo, goal: object) -> str:
     with pytest.raises(Refused) as refused:
         repo.decide(goal)
@@ -105,7 +98,10 @@ def test_the_placement_of_the_documentation_is_told_as_it_says() -> None:
 
 def test_the_capacity_of_the_documentation_is_kept() -> None:
     example = data("placement.md", f"{_EDGE} capacity")
-    repo = MemoryRepo(with_nodes(example["nodes"]) | with_services(example["services"]))
+    definition = yaml.safe_load(configuration()[APPDEF])
+    for name, more in example["services"].items():
+        definition["services"][name] |= more
+    repo = MemoryRepo(with_nodes(example["nodes"]) | {APPDEF: yaml.safe_dump(definition)})
     goal = demand()
     repo.send(goal)
     goal["demand"], goal["applications"][0]["id"] = "second", "edge/second"

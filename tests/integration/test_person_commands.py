@@ -12,7 +12,6 @@ from tests.kit.goals import perception
 from tests.kit.repo import GitRepo, git
 
 pytestmark = pytest.mark.usefixtures("git_environment")
-IDLE = "overrides/idle.yaml"
 
 
 @pytest.fixture

@@ -59,10 +59,6 @@ def edit(file: Path, replaced: dict[str, str]) -> None:
     file.write_text(text)
 
 
-def newer_images(branch: Path) -> None:
-    edit(branch / "registry" / "images.yaml", {"tag: 2025-04": "tag: 2025-09"})
-
-
 def claim(folder: Path, needle: str = "\napplication:\n") -> Path:
     files = (folder / "ledger").rglob("*.yaml")
     (found,) = [path for path in files if needle in path.read_text()]
@@ -119,7 +115,7 @@ def test_git_runs_no_program_of_the_checkout_and_writes_nothing_into_it(
     options = {"splitIndex": "true", "fsmonitor": str(file), "hooksPath": "hooks"}
     for name, value in options.items():
         git(branch, "config", f"core.{name}", value)
-    newer_images(branch)
+    edit(branch / "registry" / "images.yaml", {"tag: 2025-04": "tag: 2025-09"})
     before = {path: path.read_bytes() for path in branch.rglob("*") if path.is_file()}
     assert check().code == 0
     assert {path: path.read_bytes() for path in branch.rglob("*") if path.is_file()} == before

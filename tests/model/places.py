@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from tests.model.books import Books, Key, Refused
 from tests.model.listed import Claim, Goal, Subject
@@ -48,7 +47,7 @@ class Places(Books):
                 return "unchanged"
             del self.waiting[demand]
             return "released"
-        if not lacks_node(goal):
+        if not any("place" in app for app in goal.get("applications", [])):
             return super()._taken(goal, now, received)
         for subject, claim in self.of(demand).items():
             return self._put_again(goal, now, subject, claim)
@@ -108,11 +107,6 @@ class Places(Books):
 
     def waiting_files(self) -> dict[str, tuple[int, str, frozenset[str]]]:
         return {name: (one.priority, one.since, one.who) for name, one in self.waiting.items()}
-
-
-def lacks_node(goal: Goal) -> bool:
-    apps: list[dict[str, Any]] = goal.get("applications", [])
-    return any("place" in app for app in apps)
 
 
 def _at(goal: Goal, node: str) -> Goal:

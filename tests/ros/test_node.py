@@ -36,12 +36,6 @@ from tests.kit.repo import Person, git, hook, keygen, tip
 from tests.kit.ros import Client, Serve, Served
 
 
-def held_remote(bare: Path) -> str:
-    """Return the URL of a repository that delays every push until its folder has a file ``go``."""
-    hook(bare, "pre-receive", "for _ in $(seq 4800); do [ -e go ] && exit; sleep 0.05; done")
-    return f"file://{bare}"
-
-
 def test_a_client_that_numbers_its_goals_ends_what_it_joined_if_ids_are_ignored(
     serve: Serve, client: Client
 ) -> None:
@@ -197,7 +191,9 @@ def test_a_hundred_goals_at_once_are_all_answered_and_none_is_lost(
 def test_a_goal_can_be_cancelled_until_it_is_committed_and_a_stopped_node_finishes_open_goals(
     serve: Serve, client: Client, bare: Path
 ) -> None:
-    served = serve(held_remote(bare))
+    # every push waits until the folder has a file `go`
+    hook(bare, "pre-receive", "for _ in $(seq 4800); do [ -e go ] && exit; sleep 0.05; done")
+    served = serve(f"file://{bare}")
     client.ready()
     committed = client.send(connection(1))
     client.wait(lambda: any(text.startswith("committed") for text in committed.feedback))

@@ -255,9 +255,8 @@ class World(MemoryRepo):
 
 
 def _purpose(entry: Mapping[str, Any]) -> str:
-    if entry["source"] is None:
-        return ", ".join(entry["applications"])
-    return f"{entry['source']} {entry['source_topic']}"
+    of_source = f"{entry['source']} {entry['source_topic']}"
+    return of_source if entry["source"] else ", ".join(entry["applications"])
 
 
 # ---- the run ----

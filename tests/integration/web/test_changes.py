@@ -214,18 +214,14 @@ def test_views_derived_step_by_step_equal_views_derived_from_scratch(
     another["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station01"]
     for goal in (joins[2], another, another | {"shutdown": True}, *joins[3:]):
         book(shown.generator, goal)
-        _assert_taken_over(shown)
-
-
-def _assert_taken_over(shown: Shown) -> None:
-    for name in LISTS:
-        shown.look(f"/{name}")
-    now = shown.follower.newest
-    anew = replace(now, derived={})
-    assert now.targets == anew.targets
-    assert now.claims_of_releases == anew.claims_of_releases
-    for name in LISTS:
-        assert sorted(map(str, rows_of(now, name))) == sorted(map(str, rows_of(anew, name)))
+        for name in LISTS:
+            shown.look(f"/{name}")
+        now = shown.follower.newest
+        anew = replace(now, derived={})
+        assert now.targets == anew.targets
+        assert now.claims_of_releases == anew.claims_of_releases
+        for name in LISTS:
+            assert sorted(map(str, rows_of(now, name))) == sorted(map(str, rows_of(anew, name)))
 
 
 def test_what_is_gone_has_a_list_of_its_own(shown: Shown) -> None:
