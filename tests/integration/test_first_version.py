@@ -38,10 +38,6 @@ def documents(files: dict[str, str]) -> dict[str, Any]:
     }
 
 
-def with_todays_topics(text: str) -> str:
-    return re.sub(r" /(edge|cloud)/(\w+_(?:raw_objects|global_\w+))$", r" /\1_\2", text, flags=re.M)
-
-
 def without_labels(document: Any) -> Any:
     metadata = {name: item for name, item in document["metadata"].items() if name != "labels"}
     return document | {"metadata": metadata}
@@ -64,7 +60,9 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
     assert "od-edge-station00" in books["services"]
     assert on("log").code == on("why", "od-edge-station00").code == 0
     old, old_ledger = state.files(), ledger(state)
-    manifests = {path: with_todays_topics(text) for path, text in state.manifests().items()}
+    # the output topics of a fusion have other names today
+    topics = re.compile(r" /(edge|cloud)/(\w+_(?:raw_objects|global_\w+))$", re.M)
+    manifests = {path: topics.sub(r" /\1_\2", text) for path, text in state.manifests().items()}
     assert {p for p, text in manifests.items() if text != state.manifests()[p]} == {
         path for path in manifests if path.rpartition("/")[2].startswith("of-")
     }

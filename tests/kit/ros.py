@@ -196,11 +196,8 @@ class Client:
             assert time.monotonic() < end, "the condition did not hold in time"
             self.executor.spin_once(timeout_sec=0.05)
 
-    def reaches_a_node(self) -> bool:
-        return bool(self._client.server_is_ready())
-
     def ready(self) -> None:
-        self.wait(self.reaches_a_node)
+        self.wait(self._client.server_is_ready)
         self.ask(lambda: ask_the_node(self._client))
 
     def ask(self, call: Callable[[], Any]) -> None:

@@ -26,14 +26,6 @@ from tests.kit.rig import NOW, Person, Proposed, Stages, goal
 
 TABLES = plain_yaml.beside(__file__)
 
-# ---- away and back ----
-
-
-def test_without_a_clone_a_remote_that_is_away_is_told_at_once(bare: Path) -> None:
-    with pytest.raises(StateRepoError, match="cannot be fetched"):
-        Generator(bare.with_name("nothing.git").as_uri())
-
-
 # ---- denied ----
 
 

@@ -23,7 +23,6 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.decide.state import rendered_files
 from demandops.model.demand import goals as demand_goals
 from demandops.model.ledger.claim import ClaimKey, path_of
-from demandops.model.ledger.records import waiting_path
 from demandops.repo import reader
 from demandops.repo.merge_check import merge_check
 from demandops.serve import agenda
@@ -347,9 +346,6 @@ class Story:
         for word, text in texts.items():
             (path,) = [p for p in rig.claims(self._bare, word) if "applications" in p]
             self.change({path: text}, **commit)
-
-    def edit_waiting(self, texts: Mapping[str, Any]) -> None:
-        self.change({waiting_path(name): text for name, text in texts.items()})
 
     def claim_by_hand(self, claims: Mapping[str, Mapping[str, Any]]) -> None:
         """Copy the application's claim that holds a word, with changes, of which `check` tells."""
