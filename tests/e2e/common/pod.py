@@ -112,7 +112,7 @@ class Pod:
         os.chown(folder, 0, group)
         secret = volume.get("secret")
         account = self.manifest["spec"]["serviceAccountName"]
-        for name, content in _files(self._kube, self._namespace, account, volume).items():
+        for name, content in volume_files(self._kube, self._namespace, account, volume).items():
             file = folder / name
             file.unlink(missing_ok=True)
             file.write_bytes(content)
@@ -121,7 +121,9 @@ class Pod:
         return folder
 
 
-def _files(kube: Kube, namespace: str, account: str, volume: dict[str, Any]) -> dict[str, bytes]:
+def volume_files(
+    kube: Kube, namespace: str, account: str, volume: dict[str, Any]
+) -> dict[str, bytes]:
     """Return the content of a volume's files by name; raise LookupError if it is missing."""
     if secret := volume.get("secret"):
         data = _data(kube, "Secret", namespace, secret["secretName"])
