@@ -101,7 +101,7 @@ class Mutation(NamedTuple):
     value: Any
     new_place: Place
 
-    def isat(self, field: str) -> bool:
+    def is_at(self, field: str) -> bool:
         """Return whether a fault names the mistake's place, or a place inside or around it."""
         return any(_overlaps(field, path(place)) for place in (self.place, self.new_place))
 
@@ -213,7 +213,7 @@ def problem(
     - A fault at another place must quote one of the mutation's :meth:`~Mutation.names`.
     """
     place = path(mutation.place)
-    here = [found for found in faults if found.file == file and mutation.isat(found.field)]
+    here = [found for found in faults if found.file == file and mutation.is_at(found.field)]
     control = mutation.kind in ("reversed text", "a bell")
     in_free = any(path(mutation.place[:end]) in free for end in range(1, len(mutation.place) + 1))
     if not here and (form.forbids(mutation.document) or (control and not in_free)):

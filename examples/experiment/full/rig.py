@@ -5,10 +5,9 @@ tests need; `make demo` needs none of it.
 """
 # ruff: noqa: F401 - the experiment imports from here what is imported here
 
-from tests.e2e.common.volumes import files as volume_files
-
 from tests.e2e.common.access import access_file, documented_roles, limited, limited_world
 from tests.e2e.common.expected import CLUSTER, FUSION, WITHOUT_DEMANDS
+from tests.e2e.common.pod import volume_files
 from tests.e2e.common.world import World, demandops, environment
 from tests.e2e.rig import ENDS_WITH_US
 from tests.e2e.rig.cluster import Gitops, Rig
