@@ -304,13 +304,6 @@ def read(repo: Path, path: str) -> str:
     return GitRepo(repo).files(path).get(path, "")
 
 
-def without_vehicle01(repo: Path) -> dict[str, str | None]:
-    """Return path and text of the nodes' inventory without vehicle01, which `numbered(1)` needs."""
-    path = "inventory/nodes.yaml"
-    before, _, rest = read(repo, path).partition("  - id: vehicle01\n")
-    return {path: before + rest[rest.index("  - id: vehicle02\n") :]}
-
-
 def operations(repo: Path) -> list[str]:
     return [found for commit in commits(repo) if (found := commit.one("Operation-Id"))]
 

@@ -20,9 +20,8 @@ from tests.kit.goals import Goal, impossible, leave
 from tests.kit.goals import numbered as goal
 from tests.kit.limits import PATIENCE_S
 from tests.kit.memory import NOW, books_after
-from tests.kit.processes import Drivers, Run, Told, demand, listen, listen_to_all
+from tests.kit.processes import Drivers, Told, demand, listen, listen_to_all
 from tests.kit.repo import (
-    GIT_ENVIRONMENT,
     Commit,
     Person,
     assert_sound,
@@ -34,12 +33,10 @@ from tests.kit.repo import (
     differing,
     git,
     hook,
-    init,
     lose,
     operations,
     root,
     tip,
-    without_vehicle01,
 )
 
 

@@ -214,18 +214,12 @@ def test_an_interrupted_install_is_not_taken_for_done(
     assert calls(script) == ALL
 
 
-def test_missing_wheels_and_tools_are_named(
-    script: ModuleType, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_wheels_are_named(script: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     for wheel in ("ros_rclpy", "ros_rmw_fastrtps_cpp", "ros_ament_cmake", "catkin_pkg"):
         (script.SITE / f"{wheel}-1.0.dist-info").rmdir()
     assert script.main() == 1
     told = capsys.readouterr().err
     assert told.endswith(" -m pip install catkin-pkg ros-ament-cmake 'ros-rclpy[fastrtps]'\n")
-    monkeypatch.setenv("PATH", "")
-    assert script.main() == 1
-    told = capsys.readouterr().err
-    assert "not found: cmake, a C compiler, a C++ compiler, make or ninja\n" in told
 
 
 @pytest.mark.parametrize(("absent", "compiler", "named", "package"), TOOLS["missing"])
