@@ -1,6 +1,7 @@
 """Bad input through ``demandops request``, mainly attacks in YAML.
 
-A refused input leaves no commit and nothing in the journal, and the next demand works.
+The message names file and place, the exit code is 1, nothing is booked, and nothing is left in the
+journal.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def _nothing_is_left_behind(data_home: Path) -> Iterator[None]:
         assert not [line for line in lines if "done" not in line and line["operation"] not in done]
 
 
-TOLD = plain_yaml.load(Path(__file__).with_name("attacks.yaml").read_text())
+TOLD = plain_yaml.beside(__file__, "attacks")
 MORE = TOLD.pop("more")
 MORE += [
     "connections: [{id: c, type: 0x" + "f" * 5000 + "}]\n", "id: 0x" + "f" * 5000 + "\n",
@@ -53,53 +54,53 @@ for file in sys.argv[2:]:
 """
 
 
-class TestYamlAttacks:
-    """The message names file and place, the exit code is 1, and nothing is booked."""
+@pytest.mark.parametrize(("content", "told"), ATTACKS.values(), ids=ATTACKS)
+def test_a_file_is_refused_with_its_name_and_the_place(
+    on: On, tmp_path: Path, content: str | bytes, told: str
+) -> None:
+    file, trace = tmp_path / "request.yaml", tmp_path / "trace"
+    if isinstance(content, str):
+        content = content.replace("{trace}", str(trace)).replace("{digits}", "9" * 4000)
+        content = content.encode()
+    file.write_bytes(content)
+    errors = on.refused("request", file)
+    assert str(file) in errors and told.format(file=file) in errors
+    assert not trace.exists()
 
-    @pytest.mark.parametrize(("content", "told"), ATTACKS.values(), ids=ATTACKS)
-    def test_a_file_is_refused_with_its_name_and_the_place(
-        self, on: On, tmp_path: Path, content: str | bytes, told: str
-    ) -> None:
-        file, trace = tmp_path / "request.yaml", tmp_path / "trace"
-        if isinstance(content, str):
-            content = content.replace("{trace}", str(trace)).replace("{digits}", "9" * 4000)
-            content = content.encode()
-        file.write_bytes(content)
-        errors = on.refused("request", file)
-        assert str(file) in errors and told.format(file=file) in errors
-        assert not trace.exists()
 
-    def test_any_content_of_a_file_ends_in_an_error_message(self, on: On, tmp_path: Path) -> None:
-        file = tmp_path / "request.yaml"
-        for content in MORE:
-            file.write_text(content)
-            errors, shown = on.refused("request", file), repr(content[:24])
-            assert str(file) in errors, shown
-            assert "fault of" not in errors, f"{shown} is the user's to fix"
-            assert len(errors) < 5000, f"{shown}: a message that nobody reads"
+def test_any_content_of_a_file_ends_in_an_error_message(on: On, tmp_path: Path) -> None:
+    file = tmp_path / "request.yaml"
+    for content in MORE:
+        file.write_text(content)
+        errors, shown = on.refused("request", file), repr(content[:24])
+        assert str(file) in errors, shown
+        assert "fault of" not in errors, f"{shown} is the user's to fix"
+        assert len(errors) < 5000, f"{shown}: a message that nobody reads"
 
-    def test_brackets_without_end_crash_nothing(
-        self, state: GitRepo, tmp_path: Path, data_home: Path
-    ) -> None:
-        """The commands run in another process, because a parser might overflow its stack."""
-        files = [tmp_path / "lists.yaml", tmp_path / "mappings.yaml"]
-        for file, opening, closing in zip(files, ("[", "{a: "), "]}", strict=True):
-            file.write_text("apps: " + opening * 40_000 + closing * 40_000)
-        ran = process(sys.executable, "-c", EACH, state.path, *files)
-        assert (ran.code, ran.out) == (0, "1\n1\n")
-        for file, said in zip(files, ran.err.splitlines(), strict=True):
-            assert said.startswith(f"error: {file}: ")
-            assert "nested" in said
 
-    def test_the_traps_of_yaml_are_taken_as_text(self, on: On) -> None:
-        texts = ["yes", "null", "~", "1e3", "0o7", "010", "12:30:45", "2026-01-31", "0x1F", "<<"]
-        items = [
-            f"- {{id: {written}, type: 1, requester_ids: [{written}], source_node_id: vehicle00, "
-            f"target_node_id: edge, source_topics: [/a{number}], target_topics: [/a{number}]}}"
-            for number, written in enumerate((*(f'"{text}"' for text in texts), "2026-02-01"))
-        ]
-        on.json("request", "-", stdin="id: x\nconnections:\n" + "\n".join(items))
-        connections = on.json("bookkeeping")["connections"]
-        assert {id: entry["requesters"] for id, entry in connections.items()} == {
-            text: [text] for text in (*texts, "2026-02-01")
-        }
+def test_brackets_without_end_crash_nothing(
+    state: GitRepo, tmp_path: Path, data_home: Path
+) -> None:
+    """The commands run in another process, because a parser might overflow its stack."""
+    files = [tmp_path / "lists.yaml", tmp_path / "mappings.yaml"]
+    for file, opening, closing in zip(files, ("[", "{a: "), "]}", strict=True):
+        file.write_text("apps: " + opening * 40_000 + closing * 40_000)
+    ran = process(sys.executable, "-c", EACH, state.path, *files)
+    assert (ran.code, ran.out) == (0, "1\n1\n")
+    for file, said in zip(files, ran.err.splitlines(), strict=True):
+        assert said.startswith(f"error: {file}: ")
+        assert "nested" in said
+
+
+def test_the_traps_of_yaml_are_taken_as_text(on: On) -> None:
+    texts = ["yes", "null", "~", "1e3", "0o7", "010", "12:30:45", "2026-01-31", "0x1F", "<<"]
+    items = [
+        f"- {{id: {written}, type: 1, requester_ids: [{written}], source_node_id: vehicle00, "
+        f"target_node_id: edge, source_topics: [/a{number}], target_topics: [/a{number}]}}"
+        for number, written in enumerate((*(f'"{text}"' for text in texts), "2026-02-01"))
+    ]
+    on.json("request", "-", stdin="id: x\nconnections:\n" + "\n".join(items))
+    connections = on.json("bookkeeping")["connections"]
+    assert {id: entry["requesters"] for id, entry in connections.items()} == {
+        text: [text] for text in (*texts, "2026-02-01")
+    }

@@ -21,32 +21,20 @@ def joined(on: On, state: GitRepo) -> GitRepo:
     return state
 
 
-def test_who_is_unknown_to_git_is_told_how_to_change_that(
+def test_a_resume_ends_no_suspension_of_another_selection_with_the_same_name(
     on: On, joined: GitRepo, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("GIT_AUTHOR_NAME", "GIT_AUTHOR_EMAIL"):
-        monkeypatch.delenv(name)
-    ran = on("override", "create", "calm", "--node", "edge", "--hold", "-m", "x", "-y")
-    assert ran.code == 0
-    assert "warning: git does not know who you are, so the commit's author is " in ran.err
-    assert 'git config --global user.name "Your Name"' in ran.err
-
-
-class TestSuspend:
-    def test_a_resume_ends_no_suspension_of_another_selection_with_the_same_name(
-        self, on: On, joined: GitRepo, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(naming, "MOST_DIGITS", 1)
-        suspend = ("suspend", "--node", "vehicle00", "-m", "Sold", "-y")
-        name = name_of({"nodes": ("vehicle00",)})
-        patterns = ("vehicle00" + "*" * number for number in range(1, 100))
-        rival = next(one for one in patterns if name_of({"nodes": (one,)}) == name)
-        assert on(*suspend).code == 0
-        before = joined.tip
-        assert on("suspend", "--node", rival, "-m", "Sold", "-y").code != 0
-        assert on("resume", "--node", rival, "-y").code != 0
-        assert joined.tip == before
-        assert on("resume", "--node", "vehicle00", "-y").code == 0
+    monkeypatch.setattr(naming, "MOST_DIGITS", 1)
+    suspend = ("suspend", "--node", "vehicle00", "-m", "Sold", "-y")
+    name = name_of({"nodes": ("vehicle00",)})
+    patterns = ("vehicle00" + "*" * number for number in range(1, 100))
+    rival = next(one for one in patterns if name_of({"nodes": (one,)}) == name)
+    assert on(*suspend).code == 0
+    before = joined.tip
+    assert on("suspend", "--node", rival, "-m", "Sold", "-y").code != 0
+    assert on("resume", "--node", rival, "-y").code != 0
+    assert joined.tip == before
+    assert on("resume", "--node", "vehicle00", "-y").code == 0
 
 
 def test_a_person_sees_the_consequence_and_is_asked(joined: GitRepo) -> None:
