@@ -41,13 +41,14 @@ Run = subprocess.Popen[str]
 
 
 def listen(run: Run, on_ready: Callable[[], object] = lambda: None) -> Told:
-    """Return all events of a run at its end; ``on_ready`` is called when it takes demands."""
+    """Return all events of a run at its end; after ``on_ready``, it sends its demands."""
     told = Told()
-    assert run.stdout is not None
+    assert run.stdin is not None and run.stdout is not None
     for line in run.stdout:
         event = json.loads(line)
         if "ready" in event:
             on_ready()
+            run.stdin.close()
         elif "answer" in event:
             told.answers[event["answer"]] = event
         else:
@@ -93,8 +94,7 @@ class Drivers:
         )
         self._runs.append(run)
         assert run.stdin is not None
-        run.stdin.write(json.dumps(plan))
-        run.stdin.close()
+        print(json.dumps(plan), file=run.stdin, flush=True)
         return run
 
     def close(self) -> None:
@@ -123,13 +123,14 @@ def die_once_journaled() -> None:
 
 
 def main() -> None:
-    plan = json.load(sys.stdin)
+    plan = json.loads(sys.stdin.readline())
     force_writes(plan["synced"])
     agenda.LONGEST_EVALUATION_S = 60.0  # so that no slow machine publishes a batch in two parts
     if plan["dies"]:
         die_once_journaled()
     generator = Generator(plan["address"])
     tell(ready=True)
+    sys.stdin.read()  # until all others are ready too
 
     def play(lane: list[dict[str, Any]]) -> None:
         for one in lane:
