@@ -96,7 +96,7 @@ def audit(folder: Path) -> list[dict[str, object]]:
         f"why od-{first}-{newcomer}",  # it stopped
         f"log --requester {newcomer}",
         "verify main~300..main",
-        "verify main~30..main --whole",
+        "verify main~300..main --whole",
     ):
         start = time.perf_counter()
         with redirect_stdout(StringIO()) as told:

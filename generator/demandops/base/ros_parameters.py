@@ -1,8 +1,8 @@
 """ROS parameters as YAML and JSON hold them: their dotted names, and what no node can have.
 
 The values of a chart go through it before they are committed, and a parameter file before it is set
-in a node. ROS's own reader tells little: of `{a.b: 1, a: {b: 2}}` it takes the
-last one, of `[[1]]` the inner list, and `[null]` becomes the word.
+in a node. ROS's own reader tells little: of `{a.b: 1, a: {b: 2}}` it takes the last one, of `[[1]]`
+the inner list, and `[null]` becomes the word.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def _problem(value: object) -> str:
     return ""
 
 
-_EXACT = 2**53  # the numbers of JSON are exact up to here
+LARGEST_EXACT = 2**53  # up to here, Helm and JSON keep each integer as it is
 
 
 def exact_numbers(value: Any) -> Any:  # noqa: ANN401
@@ -84,6 +84,6 @@ def exact_numbers(value: Any) -> Any:  # noqa: ANN401
         return [exact_numbers(float(each) if is_mixed else each) for each in value]
     if isinstance(value, float) and value.is_integer():
         return f"!!float {to_json(value)}"
-    if type(value) is int and abs(value) > _EXACT:
+    if type(value) is int and abs(value) > LARGEST_EXACT:
         return f"!!int {value}"
     return value

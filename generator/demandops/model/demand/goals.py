@@ -19,6 +19,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import MOST_FAULTS, Fault, Refused, fault, field_path
 from demandops.base.naming import id_problem, one_form
 from demandops.base.quoting import quoted
+from demandops.base.ros_parameters import LARGEST_EXACT
 from demandops.base.settings import API_VERSION
 from demandops.connections import connection_types
 from demandops.connections.connection import Connection, Route
@@ -166,7 +167,6 @@ _LONGEST_KEY = 128
 
 # Helm's toJson writes these as they are, and no YAML may have them: the release would fail for all.
 _CONTROL = re.compile("[\x7f-\x9f\ufffe\uffff]")
-_EXACT = 2**53  # up to here, Helm reads each integer as it is
 
 
 def _value_problem(value: object, depth: int) -> str:
@@ -179,8 +179,8 @@ def _value_problem(value: object, depth: int) -> str:
     texts = [value, *value] if isinstance(value, dict) else [value]
     if any(isinstance(text, str) and _CONTROL.search(text) for text in texts):
         return f"holds {quoted(str(value))}, which no chart can write; leave out control characters"
-    if type(value) is int and abs(value) > _EXACT:
-        return f"holds {value}, which Helm rounds; give at most {_EXACT}, or a text"
+    if type(value) is int and abs(value) > LARGEST_EXACT:
+        return f"holds {value}, which Helm rounds; give at most {LARGEST_EXACT}, or a text"
     if isinstance(value, dict) and (long := [key for key in value if len(key) > _LONGEST_KEY]):
         length = f"{len(long[0])} characters, but at most {_LONGEST_KEY} are allowed"
         return f"has the key {quoted(long[0])} of {length}"
