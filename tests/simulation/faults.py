@@ -216,15 +216,13 @@ FAULTS: dict[str, Fault] = {
         lambda plus, usage, more: plus(usage, {need: n for need, n in more.items() if n > 0})),
 
     # ---- nodes of clusters ----
-    "see_no_cordon": Fault(0, node_discovery, "discover",
+    "see_no_cordon": Fault(4, node_discovery, "discover",
         lambda discover, cluster, seen, *more:
             discover(cluster, [one._replace(is_cordoned=False) for one in seen], *more)),
-    "let_nodes_go_only_with_other_news": Fault(0, node_discovery, "discover",
+    "let_nodes_go_only_with_other_news": Fault(1, node_discovery, "discover",
         lambda discover, *given: discover(*given)._replace(has_gone=False)),
-    "take_out_nodes_that_claims_need": Fault(0, node_discovery, "discover",
+    "take_out_nodes_that_claims_need": Fault(15, node_discovery, "discover",
         lambda discover, *given: discover(*given[:-1], lambda id: False)),
-    "leave_what_people_write_of_a_cluster": Fault(0, snapshot, "_judged",
-        lambda judged, tree, written, before: judged(tree, tree, before)),
 
     # ---- overrides ----
     "apply_no_override_to_what_a_demand_changes": Fault(29, decision, "plan_change",
