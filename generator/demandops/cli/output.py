@@ -1,6 +1,4 @@
-"""The output of commands: tables for people, JSON for programs, errors and progress on stderr.
-
-Functions that need `rich` import it themselves, because `demandops --help` imports this module.
+"""The output of commands: text and its pager, errors and progress on stderr, and the streams.
 """
 
 from __future__ import annotations
@@ -12,34 +10,16 @@ import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from demandops.base import quoting
 from demandops.base.runtime import REAL
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.text import Text
-
 _MOST_LISTED = 3
 
 Progress = Callable[[int, int], None]
-
-
-def console(stderr: bool = False) -> Console:
-    from rich.console import Console  # noqa: PLC0415
-
-    class QuotingConsole(Console):
-        def render_str(self, text: str, **how: Any) -> Text:  # noqa: ANN401 - as rich has it
-            return super().render_str(quoting.lines(text), **how)
-
-    # elsewhere than on a terminal, a program may read the lines, so they are not wrapped
-    stream = sys.stderr if stderr else sys.stdout
-    width = None if stream.isatty() else 200
-    # rich would take [bold] and :smile: in the texts of people for its own markup
-    return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
 # What the command has changed already, to be told if its output cannot be written.
@@ -100,6 +80,10 @@ def painted(text: str, style: str) -> str:
     if style in ("bold", "dim"):
         return click.style(text, **{style: True})
     return click.style(text, fg=style)
+
+
+def say(text: str) -> None:
+    click.echo(quoting.lines(text))
 
 
 def print_lines(lines: list[str]) -> None:
