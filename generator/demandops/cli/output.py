@@ -1,5 +1,4 @@
-"""The output of commands: text and its pager, errors and progress on stderr, and the streams.
-"""
+"""The output of commands: text and its pager, errors and progress on stderr, and the streams."""
 
 from __future__ import annotations
 
@@ -136,9 +135,9 @@ at_option = click.option(
 
 
 def read_by(parse: Callable[[str], Any]) -> Callable[..., Any]:
-    def value(ctx: click.Context, param: click.Parameter, text: str) -> Any:  # noqa: ANN401
+    def value(ctx: click.Context, param: click.Parameter, given: Any) -> Any:  # noqa: ANN401
         try:
-            return parse(text)
+            return tuple(map(parse, given)) if isinstance(given, tuple) else parse(given)
         except ValueError as error:
             raise click.BadParameter(str(error)) from None
 
@@ -152,36 +151,26 @@ def show_slow(text: str) -> None:  # an empty text clears the line
 
 
 @contextmanager
-def busy(title: str) -> Iterator[None]:
-    # on a terminal, the title and the elapsed seconds, if the block takes a second or longer
-    ended = REAL.event()
+def busy(title: str) -> Iterator[Progress]:
+    # on a terminal, the title, how far the block says that it is, and the elapsed seconds, if it
+    # takes a second or longer
+    ended, reached = REAL.event(), ""
+
+    def report(done: int, total: int) -> None:
+        nonlocal reached
+        reached = f", {done} of {total}"
 
     def tick() -> None:
         seconds = 0
         while not ended.wait(1):
             seconds += 1
-            show_slow(f"{title}, {seconds} s")
+            show_slow(f"{title}{reached}, {seconds} s")
 
     thread = REAL.start_thread("busy", tick) if sys.stderr.isatty() else None
     try:
-        yield
+        yield report
     finally:
         ended.set()
         if thread is not None:
             thread.join()
             show_slow("")
-
-
-@contextmanager
-def progress(title: str) -> Iterator[Progress]:
-    # on a terminal, how far the work is, if it takes long
-    start = REAL.monotonic()
-
-    def report(done: int, total: int) -> None:
-        if REAL.monotonic() - start >= 0.5:
-            show_slow(f"{title}, {done} of {total}")
-
-    try:
-        yield report
-    finally:
-        show_slow("")

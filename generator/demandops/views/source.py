@@ -8,7 +8,6 @@ from datetime import datetime
 from typing import Any, Generic, TypeVar
 
 from demandops.base.errors import DemandOpsError
-from demandops.base.naming import SubjectKind
 from demandops.base.runtime import REAL
 from demandops.cluster.health import (
     ClusterDomain,
@@ -182,14 +181,16 @@ class Source:
         needing: dict[ReleaseKey, list[Claim]] = {}
         for change in changes:
             was, now = before.active.ledger.get(change.key), self.active.ledger.get(change.key)
-            for key in keys_of_claims(before.active, [was]) if was else ():
-                needing.setdefault(key, [])
-            for key in keys_of_claims(self.active, [now]) if now else ():
-                needing.setdefault(key, []).append(now)
-                # the views show requesters, but `affected_keys` omits a release whose file stays
-                # the same although its requesters changed
-                if was and was.requesters != now.requesters:
-                    keys.add(key)
+            if was:
+                for key in keys_of_claims(before.active, [was]):
+                    needing.setdefault(key, [])
+            if now:
+                for key in keys_of_claims(self.active, [now]):
+                    needing.setdefault(key, []).append(now)
+                    # the views show requesters, but `affected_keys` omits a release whose file
+                    # stays the same although its requesters changed
+                    if was and was.requesters != now.requesters:
+                        keys.add(key)
         planned, changed = {**before.planned}, {change.key for change in changes}
         for key, claims in needing.items():
             if earlier := planned.get(key):

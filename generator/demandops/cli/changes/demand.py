@@ -27,7 +27,7 @@ from demandops.cli.changes import ledger_change
 from demandops.cli.changes.ledger_change import started_generator
 from demandops.cli.changes.person_change import confirm, consequence
 from demandops.cli.formats import faults_of, output_option, print_json
-from demandops.cli.output import done, errors, progress, say
+from demandops.cli.output import busy, done, errors, say
 from demandops.cli.queries.commits import release_lines
 from demandops.cli.target import (
     NO_STATE_REPO,
@@ -278,7 +278,7 @@ def _book(
 
     has_started = False
     try:
-        with started_generator(state_repo, signing_key) as generator, progress("booking") as report:
+        with started_generator(state_repo, signing_key) as generator, busy("booking") as report:
             has_started = True
             for document in documents:
                 submit(generator, document)
@@ -323,7 +323,7 @@ def _book(
 def _decided(
     documents: list[Document], state_repo: str
 ) -> Iterator[tuple[int, Document, Decision | InvalidInput]]:
-    with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
+    with reader.opened(state_repo) as repo, busy("reading the ledger") as report:
         refuse_other_render_version(repo.objects, repo.repository.tip())
         state = repo.snapshot(progress=report).state
         # each request is decided as if the requests before it were booked
