@@ -170,8 +170,7 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     )
     cross_check(config, reader)
     if reader.faults:
-        faults = (discovered.in_entry(each, reader) for each in reader.faults)
-        raise InvalidInput(dict.fromkeys(faults))
+        raise discovered.InvalidConfig(reader)
     return config
 
 
