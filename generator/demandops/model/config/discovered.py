@@ -163,15 +163,15 @@ class InvalidConfig(InvalidInput):
         for fault in reader.faults:
             match = _OF_NODE.fullmatch(fault.field) if is_discovered(fault.file) else None
             # the faults of an edited file, from which no node was read, are its own
-            id = ids.get((fault.file, match[1])) if match else None
-            if match is None or id is None:
+            owner = ids.get((fault.file, match[1])) if match else None
+            if match is None or owner is None:
                 faults[fault] = fault
                 continue
             if match[2] != "id":  # people can mend it in the entry, and there it is one for all
                 name = fault.file.rpartition("/")[2].removesuffix(".yaml")
                 file, place = reader.places[CLUSTERS_FILE][name]
-                field = ".".join(filter(None, [place, "discovery.entry", match[2]]))
+                field = f"{place}.discovery.entry" + (f".{match[2]}" if match[2] else "")
                 fault = replace(fault, file=file, field=field)  # noqa: PLW2901
-            self.of_nodes.setdefault(id, fault)
+            self.of_nodes.setdefault(owner, fault)
             faults.setdefault((fault.file, fault.field), fault)
         super().__init__(faults.values())
