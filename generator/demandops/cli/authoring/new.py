@@ -238,8 +238,7 @@ def application(  # noqa: PLR0913 - as many as options
 
     \b
     Examples:
-      demandops new application tracking --input camera=sensor_msgs/msg/Image \
-        --service detector=my_package/detector --image ghcr.io/me/tracking:1.0
+      demandops new application x --input a=b/msg/C --service s=p/f --image r/i:1
     """
     with busy("reading the state repo"):
         with edited_checkout.opened(directory) as (_, tree):
