@@ -9,7 +9,7 @@ from typing import Any
 import click
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_secret
-from demandops.cli.output import errors, progress
+from demandops.cli.output import busy, errors
 from demandops.cli.target import signing_option
 from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.leadership import Leadership
@@ -119,7 +119,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
         ros_process.log_to(get_logger("demandops"), settings["log_level"])
         secret = read_secret(webhook_secret_file) if webhook_secret_file else b""
         clusters = clusters_file.read(access_file).clusters if access_file else {}
-        with progress("reading the ledger") as report:
+        with busy("reading the ledger") as report:
             generator = Generator(
                 settings["state_repo"],
                 progress=report,

@@ -40,9 +40,6 @@ class _Format(click.Choice[str]):
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
         if value.startswith(_PATH) and any(choice.startswith(_PATH) for choice in self.choices):
             return value
-        if "=" in value and ctx is not None and ctx.info_name == "application":
-            message = "is how to print; list outputs of services in appdef.yaml (docs/appdef.md)"
-            self.fail(message, param, ctx)
         return super().convert(value, param, ctx)
 
 

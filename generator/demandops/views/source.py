@@ -8,7 +8,6 @@ from datetime import datetime
 from typing import Any, Generic, TypeVar
 
 from demandops.base.errors import DemandOpsError
-from demandops.base.naming import SubjectKind
 from demandops.base.runtime import REAL
 from demandops.cluster.health import (
     ClusterDomain,
@@ -178,37 +177,25 @@ class Source:
         subjects = [*dict.fromkeys(subject_before.get(id) or subject_now[id] for id in differing)]
         changes = changes_on(old.ledger, new.ledger, subjects)
         keys: set[ReleaseKey] = {*affected_keys(old, new, changes)}
-        for was, now in ((change.before, change.after) for change in changes):
-            # the views show requesters, but `affected_keys` omits a release whose file stays the
-            # same although its requesters changed
-            if was and now and was.requesters != now.requesters:
-                keys.update(keys_of_claims(self.active, [now]))
         # what is planned as before may be needed by other claims
-        gone: set[int] = set()
-        fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
-        for subject in subjects:
-            claims = self.active.ledger.claims_on(subject)
-            ids_before = {id(claim) for claim in before.active.ledger.claims_on(subject)}
-            gone |= ids_before - {id(claim) for claim in claims}
-            fresh[subject.kind][subject.id] = [
-                claim for claim in claims if id(claim) not in ids_before
-            ]
-        planned = {**before.planned}
-        for key, earlier in before.planned.items():
-            if earlier is None:
-                continue
-            release = earlier.release
-            if isinstance(release, ServiceRelease):
-                kind, ids = SubjectKind.APPLICATION, release.applications
-            else:
-                kind, ids = SubjectKind.CONNECTION, release.connections
-            if fresh[kind].keys().isdisjoint(ids):
-                continue
-            kept = [claim for claim in earlier.claims if id(claim) not in gone]
-            added = [claim for id in ids for claim in fresh[kind].get(id, ())]
-            needing = [claim for claim in added if needs(claim, release)]
-            if needing or len(kept) < len(earlier.claims):
-                planned[key] = replace(earlier, claims=by_booking([*kept, *needing]))
+        needing: dict[ReleaseKey, list[Claim]] = {}
+        for change in changes:
+            was, now = before.active.ledger.get(change.key), self.active.ledger.get(change.key)
+            if was:
+                for key in keys_of_claims(before.active, [was]):
+                    needing.setdefault(key, [])
+            if now:
+                for key in keys_of_claims(self.active, [now]):
+                    needing.setdefault(key, []).append(now)
+                    # the views show requesters, but `affected_keys` omits a release whose file
+                    # stays the same although its requesters changed
+                    if was and was.requesters != now.requesters:
+                        keys.add(key)
+        planned, changed = {**before.planned}, {change.key for change in changes}
+        for key, claims in needing.items():
+            if earlier := planned.get(key):
+                kept = [claim for claim in earlier.claims if claim.key not in changed]
+                planned[key] = replace(earlier, claims=by_booking([*kept, *claims]))
         for key in keys:
             planned.pop(key, None)
             if (anew := self._plan(key)) or denied_release(new, key):

@@ -46,8 +46,8 @@ def test_a_file_follows_its_cluster(case: dict[str, Any]) -> None:
     cluster = Cluster.model_validate({"name": "c-its", **how})
     before = nodes(case["before"]) if "before" in case else None
     now = [seen(f"machine-{n}", node) for n, node in enumerate(case.get("seen", ()))]
-    needed = case.get("needed", ())
-    found = discover(cluster, now, before, NOW, case.get("files", {}), lambda id: id in needed)
+    needed, files, unfit = (case.get(name, {}) for name in ("needed", "files", "unfit"))
+    found = discover(cluster, now, before, NOW, files, unfit, lambda id: id in needed)
     assert found.path == PATH
     assert not found.text or discovered.text_of(discovered.read(found.text, PATH)) == found.text
     told = {"came": found.came, "left": found.left, "changed": found.changed}
@@ -107,12 +107,12 @@ def test_whatever_a_cluster_says_the_configuration_stays_valid(
     cluster = Cluster.model_validate({"name": "c-its", "nodes": "from-cluster"})
     text = None
     for seen in (first, second):
-        found = discover(cluster, seen, text, NOW, {}, lambda id: False)
+        found = discover(cluster, seen, text, NOW, {}, {}, lambda id: False)
         text = found.text
         config = load(configuration({"inventory/clusters.yaml": FROM_CLUSTER, found.path: text}))
         cloud = config.nodes["cloud"]
         assert (cloud.type, cloud.drained) == ("cloud", False), "as it is listed"
-        again = discover(cluster, seen, text, NOW, {}, lambda id: False)
+        again = discover(cluster, seen, text, NOW, {}, {}, lambda id: False)
         assert (again.text, again.came, again.left, again.changed) == (text, (), (), ())
 
 

@@ -20,7 +20,7 @@ from demandops.base.errors import (
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli.formats import Table, list_table, output_formats, output_option, show, table_of
-from demandops.cli.output import SIGNS, at_option, busy, errors, progress
+from demandops.cli.output import SIGNS, at_option, busy, errors
 from demandops.cli.target import name_options, state_repo_option
 from demandops.decide.bookkeeping import EntryChange, as_data, bookkeeping_changes
 from demandops.decide.bookkeeping import bookkeeping as derive
@@ -168,7 +168,7 @@ def resolved(repo: Reader, revision: str | None) -> str:
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
     commit = resolved(repo, revision)
-    with progress("reading the ledger") as report:
+    with busy("reading the ledger") as report:
         snapshot = repo.snapshot(commit, report)
     for problem in snapshots.problems_of(repo.objects, snapshot):
         errors.print(f"warning: not in effect: {problem}")

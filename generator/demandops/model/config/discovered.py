@@ -48,7 +48,7 @@ _NOTE = """\
 # Written by the generator: the nodes as the cluster has them. Edits are put back. To change a node,
 # change it in the cluster, or list it in inventory/nodes.yaml, which replaces its whole entry here.
 """
-_IN_ENTRY = re.compile(r"(nodes\[\d+\])\.(?!id$)(.*)")
+_OF_NODE = re.compile(r"(nodes\[\d+\])(?:\.(.*))?")
 
 
 # The value of the label `node_id`
@@ -109,16 +109,22 @@ def read_nodes(
         pattern, path = _pattern(reader, cluster), path_of(name)
         try:
             _ = pattern.example  # so that the faults of the entry are those of its file
-            for number, node in enumerate(read(reader.files.get(path), path)):
-                if node.id in places:  # a listed node is meant to differ, as a whole
-                    continue
-                own = node.model_dump(by_alias=True, exclude_defaults=True, exclude={"gone_since"})
-                own["drained"] = node.drained or node.gone_since is not None
-                nodes[node.id] = pattern.entry(node.id, own)
-                places[node.id] = (path, f"nodes[{number}]")
+            known = read(reader.files.get(path), path)
         except InvalidInput as error:
             reader.faults += error.faults
             reader.incomplete.add(NODES_FILE)
+            continue
+        for number, node in enumerate(known):
+            if node.id in places:  # a listed node is meant to differ, as a whole
+                continue
+            places[node.id] = (path, f"nodes[{number}]")
+            own = node.model_dump(by_alias=True, exclude_defaults=True, exclude={"gone_since"})
+            own["drained"] = node.drained or node.gone_since is not None
+            try:
+                here = replace(pattern, file=path, place=("nodes", number))
+                nodes[node.id] = here.entry(node.id, own)
+            except InvalidInput as error:
+                reader.faults += error.faults
     examples = (pattern.example for pattern in reader.patterns[NODES_FILE])
     return dict(_of_one_kind(nodes, [*listed.values(), *examples]))
 
@@ -146,12 +152,26 @@ def _of_one_kind(nodes: Mapping[str, Node], listed: Iterable[Node]) -> Iterator[
         yield id, node.model_copy(update={"properties": fitting}) if is_odd else node
 
 
-def in_entry(fault: Fault, reader: ConfigReader) -> Fault:
-    """Return a fault of a discovered node at the place where people can mend it."""
-    match = _IN_ENTRY.fullmatch(fault.field) if is_discovered(fault.file) else None
-    # the faults of an edited file, from which no node was read, are its own
-    if match is None or (fault.file, match[1]) not in reader.places[NODES_FILE].values():
-        return fault
-    name = fault.file.rpartition("/")[2].removesuffix(".yaml")
-    file, place = reader.places[CLUSTERS_FILE][name]
-    return replace(fault, file=file, field=f"{place}.discovery.entry.{match[2]}")
+class InvalidConfig(InvalidInput):
+    """The faults of a configuration; ``of_nodes`` has one of each discovered node with faults."""
+
+    def __init__(self, reader: ConfigReader) -> None:
+        ids, faults = dict[tuple[str, str], str](), dict[object, Fault]()
+        for id, at in reader.places[NODES_FILE].items():
+            ids.setdefault(at, id)  # a machine's own node is before those of its further domains
+        self.of_nodes: dict[str, object] = {}
+        for fault in reader.faults:
+            match = _OF_NODE.fullmatch(fault.field) if is_discovered(fault.file) else None
+            # the faults of an edited file, from which no node was read, are its own
+            owner = ids.get((fault.file, match[1])) if match else None
+            if match is None or owner is None:
+                faults[fault] = fault
+                continue
+            if match[2] != "id":  # people can mend it in the entry, and there it is one for all
+                name = fault.file.rpartition("/")[2].removesuffix(".yaml")
+                file, place = reader.places[CLUSTERS_FILE][name]
+                field = f"{place}.discovery.entry" + (f".{match[2]}" if match[2] else "")
+                fault = replace(fault, file=file, field=field)  # noqa: PLW2901
+            self.of_nodes.setdefault(owner, fault)
+            faults.setdefault((fault.file, fault.field), fault)
+        super().__init__(faults.values())

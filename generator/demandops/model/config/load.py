@@ -12,7 +12,6 @@ from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import TypeVar
 
-from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION, RENDER_VERSION
 from demandops.model.config import config as configs
@@ -170,8 +169,7 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     )
     cross_check(config, reader)
     if reader.faults:
-        faults = (discovered.in_entry(each, reader) for each in reader.faults)
-        raise InvalidInput(dict.fromkeys(faults))
+        raise discovered.InvalidConfig(reader)
     return config
 
 
