@@ -27,6 +27,7 @@ from demandops.decide.planning.planner import running_version
 from demandops.model.config.base_model import duration_text, parse_file, parse_time, relative
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
+from demandops.model.demand.demand import Lease
 from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
@@ -263,7 +264,6 @@ def state_of(source: Source, claims: Sequence[Claim]) -> str:
 
 def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
     """Return what items have in common that consist of claims."""
-    leases = [claim.lease for claim in claims if claim.lease]
     nodes = sorted({node for claim in claims for node in nodes_of(claim)})
     return {
         "state": state,
@@ -271,10 +271,14 @@ def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
         "nodes": nodes,
         "domains": domains_of(source, nodes),
         "since": time_data(min(claim.booked for claim in claims)),
-        # the first that ends
-        "lease": lease_data(min(leases, key=lambda lease: lease.until) if leases else None),
+        "lease": lease_data(_first_lease(claims)),
         "ended": None,
     }
+
+
+def _first_lease(claims: Iterable[Claim]) -> Lease | None:  # that ends
+    leases = (claim.lease for claim in claims if claim.lease)
+    return min(leases, key=lambda lease: lease.until, default=None)
 
 
 def _demands(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -305,16 +309,12 @@ def _demand(source: Source, holds: list[Claim] | WaitingDemand, state: str, runs
 
 
 def _leases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    leased = [(id, values) for id, values in _demands(source) if _first_end(values[0])]
-    yield from sorted(leased, key=lambda pair: (_first_end(pair[1][0]), pair[0]))
-
-
-def _first_end(holds: list[Claim] | WaitingDemand) -> str:
-    if isinstance(holds, WaitingDemand):
-        return ""
-    leases = (lease_data(claim.lease) for claim in holds if claim.lease)
-    # "~" sorts a lease that has not started behind every time
-    return min((lease["until"] or "~" for lease in leases if lease), default="")
+    leased = [
+        (lease.until, id, values)
+        for id, values in _demands(source)
+        if id in source.claims_of_demands and (lease := _first_lease(values[0]))
+    ]
+    yield from ((id, values) for _, id, values in sorted(leased, key=lambda each: each[:2]))
 
 
 def _applications(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -852,7 +852,7 @@ KINDS: dict[str, Kind] = {
             (
                 *(Column("subject", "Subject", texts_of=_subject, links="held"), STATE, REQUESTERS),
                 *(Column("demand", "Demand", 3, links="demand"), LEASE, SINCE),
-                Column("suspended_by", "Suspended by", 7, texts_of=_suspending, links="override"),
+                Column("suspended_by", "Suspended by", 1, texts_of=_suspending, links="override"),
                 *(_wide("request", "Request"), _wide("file", "File")),
             ),
             _claims,
