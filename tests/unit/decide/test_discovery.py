@@ -118,10 +118,12 @@ def test_whatever_a_cluster_says_the_configuration_stays_valid(
 
 def test_values_and_nodes_that_contradict_other_files_do_not_count() -> None:
     sizes = {"bus1": 3, "bus2": "large", "bus3": "large"}
-    found = [{"id": id, "properties": {"size": size}} for id, size in sizes.items()]
+    found = [{"id": id, "properties": {"size": size, "doors": size}} for id, size in sizes.items()]
     file = nodes([*found, {"id": "bus9"}])
     size = ("- id: cloud\n", "- id: cloud\n    properties: {size: 3}\n")
+    doors = ("prefix: of\n", "prefix: of\n    place: {properties: {doors: {min: 2}}}\n")
     changed = edited("inventory/nodes.yaml", *size) | {"inventory/clusters.yaml": FROM_CLUSTER}
+    changed |= edited("appdefs/object-detection-fusion/appdef.yaml", *doors)
     policy = plain_yaml.load(skeleton()[POLICY])
     policy["domains"][0]["nodes"] = ["vehicle*", "station*", "edge", "cloud", "bus*"]
     policy["domains"].append(
@@ -129,6 +131,6 @@ def test_values_and_nodes_that_contradict_other_files_do_not_count() -> None:
     )
     changed |= {POLICY: json.dumps(policy), PATH: file}
     config = load(configuration(changed))
-    assert [config.nodes[id].properties for id in sizes] == [{"size": 3}, {}, {}]
+    assert [config.nodes[id].properties for id in sizes] == [{"size": 3, "doors": 3}, {}, {}]
     assert "bus9" in config.nodes
     assert "bus9" not in config.domain_of, "two access domains match it"
