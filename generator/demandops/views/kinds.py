@@ -36,7 +36,7 @@ from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.repo.reader import Reader
 from demandops.views import vocabulary
-from demandops.views.rows import Column, Row, TextsOf
+from demandops.views.rows import Column, Row, TextsOf, labels_of
 from demandops.views.source import Source, since_of, word_of, worst_word
 from demandops.views.vocabulary import Json, claim_data, lease_data, subject_text, time_data
 
@@ -76,14 +76,7 @@ class Kind:
         return self.name.capitalize()
 
     def row(self, item: Json) -> Row:
-        # the item's texts by label: `requesters` of an item is its label `requester`
-        labels: dict[str, list[str]] = {}
-        for key, value in item.items():
-            texts = [value] if isinstance(value, str) else value
-            if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
-                label = key[:-1] if key.endswith("s") and not isinstance(value, str) else key
-                labels.setdefault(label, []).extend(texts)
-        more = self.labels(item)
+        labels, more = labels_of(item), self.labels(item)
         more[self.word] = (*more.get(self.word, ()), item["name"])
         for key, words in more.items():
             labels[key] = [*dict.fromkeys((*labels.get(key, ()), *filter(None, words)))]
