@@ -182,8 +182,7 @@ def decide(
             checkpoint=checkpoint,
         )
         checkpoint()
-        claims = [(change.before, change.after) for change in changes.claims]
-        required_by, approved_by = permission.approval(request, claims, config)
+        required_by, approved_by = permission.approval(request, changes.claims, config)
         # a demand may list one thing twice, and several releases may have one reason
         notes = dict.fromkeys(notes_on(request, state, after, changes, rendered))
         for difference in booked.differing:
@@ -515,8 +514,7 @@ def may_demand(
             if matches(requester, rule.requesters)
             and permission.first_uncovered(rule, access) is None
         )
-        pairs = ((change.before, change.after) for change in changes.claims)
-        approval = permission.approval(demand, pairs, config)
+        approval = permission.approval(demand, changes.claims, config)
         answer = Answer(name, tuple(dict.fromkeys(faults)), tuple(rules), *approval)
         if not faults:
             break

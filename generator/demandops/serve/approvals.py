@@ -116,7 +116,9 @@ class Approvals:
         # Before the batch is evaluated: once a branch is gone, nobody can merge it. If a person
         # merged it earlier, the batch is evaluated on a tip that includes the merge.
         for ticket in batch:
-            if (request := _release_request(ticket, state)) is None:
+            if ticket.withdrawn or not ticket.demand.is_release:
+                continue
+            if (request := admit_or_none(state, ticket.demand)) is None:  # it would be refused
                 continue
             for proposal in self.proposals.values():
                 if not releases(request, proposal.requests, state.config):
@@ -127,15 +129,6 @@ class Approvals:
                 # the next check answers the demands, because their branch may be merged already
                 self._changed.append(proposal.branch)
                 ticket.has_released = True
-
-    def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        request = _release_request(by, state) if earlier else None
-        for index, (ticket, result) in enumerate(earlier):
-            if not (request and isinstance(result, Decision)):
-                continue
-            if releases(request, [result.request], state.config):
-                earlier[index] = (ticket, errors.Withdrawn(RELEASED))
-                by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
         """Add a demand to the proposal of the same demand, or to a new one, or answer it."""
@@ -492,13 +485,6 @@ class Approvals:
             self._demands.fail(proposal.tickets, error, keep=True)
         self.proposals = {}
         self._forge.close()
-
-
-def _release_request(ticket: Ticket, state: State) -> Demand | None:
-    # None also if the request would be refused
-    if ticket.withdrawn or not ticket.demand.is_release:
-        return None
-    return admit_or_none(state, ticket.demand)
 
 
 def commit_without_files(

@@ -23,11 +23,10 @@ from demandops.repo.load.ledger_files import restoration
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve import agenda
-from demandops.serve.agenda import Agenda, Backoff, RateLimit, What
+from demandops.serve.agenda import Agenda, Backoff, NodeDiscovery, NodesOf, RateLimit, What
 from demandops.serve.approvals import Approvals, Result, commit_without_files
 from demandops.serve.demands import Demands
 from demandops.serve.journal import Receipt, Ticket
-from demandops.serve.node_discovery import NodeDiscovery, NodesOf
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 log = logging.getLogger("demandops")
@@ -246,11 +245,11 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > agenda.LONGEST_EVALUATION_S
+            # it may release a demand of this batch, which must be proposed first
+            is_late |= ticket.demand.is_release and any(isinstance(r, Decision) for _, r in results)
             if number and (is_late or len(json.dumps(ticket.demand.goal)) > agenda.USUAL_LENGTH):
                 part, left = part[:number], part[number:] + left
                 break
-            if ticket.demand.is_release:
-                self._approvals.withdraw_released(results, ticket, commits.head.state)
             results.append(self._evaluate(commits, ticket))
             if commits.is_empty:
                 independent = len(results)

@@ -13,7 +13,7 @@ from demandops.decide.discovery import ClusterNode
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.repo.load.snapshot import follow
-from demandops.serve import node_discovery
+from demandops.serve import agenda
 from demandops.serve.generator import Generator
 
 from tests.kit import plain_yaml, rig
@@ -65,7 +65,7 @@ class Cluster:
 
     def look(self) -> None:
         """Have the generator look at the nodes, a minute after the last time."""
-        self.change(node_discovery._PAUSE_S + node_discovery._GATHER_S)
+        self.change(agenda._NODES_PAUSE_S + agenda._GATHER_S)
 
     @property
     def state(self) -> State:
@@ -125,7 +125,7 @@ def test_what_changes_within_a_minute_shares_a_commit(cluster: Cluster, bare: Pa
     cluster.look()
     for id in ("bus0", "bus1"):
         cluster.add(id, cordoned=True)
-        cluster.change(node_discovery._GATHER_S + 1)
+        cluster.change(agenda._GATHER_S + 1)
     assert cluster.discoveries == 1
     cluster.look()
     assert cluster.discoveries == 2
