@@ -364,9 +364,10 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
         )
     if isinstance(request, Restoration):
         # claims of before the upgrade may carry a route twice
-        united, _ = carriers.with_one_carrier(ledger_of(request.claims))
-        request = replace(request, claims=tuple(united))
-        request = relocation.with_restored_moves(request, state)
+        then, _ = carriers.with_one_carrier(ledger_of(request.claims))
+        then = replace(then, ended=state.ledger.ended)
+        moved = relocation.following_overrides(replace(state, ledger=then))
+        request = replace(request, claims=tuple(moved.ledger))
         if faults := list(restoration_faults(request, state)):
             raise Refused(faults)
     checkpoint()
