@@ -13,14 +13,13 @@ import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 from typing import TypeAlias
 
 from demandops.base import errors
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, fault
 from demandops.base.quoting import quoted
-from demandops.base.settings import PROPOSAL_LIMIT, RENDER_VERSION
+from demandops.base.settings import PROPOSAL_LIMIT
 from demandops.decide.decision import Decision
 from demandops.decide.state import State
 from demandops.model.demand.demand import Demand
@@ -29,7 +28,6 @@ from demandops.repo.git.repository import PushDenied, StateRepository
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.history.commit_log import RecordedOutcome
-from demandops.repo.history.commit_message import generator_signature
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Snapshot
@@ -272,7 +270,7 @@ class Approvals:
                 reason,
             )
             title = f"Reject {', '.join(demands)}: {reason}"
-            commit_without_files(commits, [[title]], trailers, now)
+            commits.commit_without_files([[title]], trailers, now)
         if not publish(commits):
             log.info("another writer was first; recording the rejections again")
 
@@ -485,17 +483,6 @@ class Approvals:
             self._demands.fail(proposal.tickets, error, keep=True)
         self.proposals = {}
         self._forge.close()
-
-
-def commit_without_files(
-    commits: CommitBatch,
-    paragraphs: list[list[str]],
-    trailers: Iterable[tuple[str, str]],
-    now: datetime,
-) -> None:
-    trailers = [*trailers, *commits.head.trailers, ("Render-Version", str(RENDER_VERSION))]
-    text, author = commit_message.compose(paragraphs, trailers), generator_signature(now)
-    commits.commit_files({}, commits.head.state, text, author, now)
 
 
 def _belongs_to_another(branch: str) -> Refused:

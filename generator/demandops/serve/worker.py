@@ -24,7 +24,7 @@ from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve import agenda
 from demandops.serve.agenda import Agenda, Backoff, NodeDiscovery, NodesOf, RateLimit, What
-from demandops.serve.approvals import Approvals, Result, commit_without_files
+from demandops.serve.approvals import Approvals, Result
 from demandops.serve.demands import Demands
 from demandops.serve.journal import Receipt, Ticket
 from demandops.templating.evaluator import DEMAND_S, processor_time
@@ -475,7 +475,7 @@ class Worker:
         if commits.is_empty:
             now = self._runtime.now()
             title, why = "Check that the server takes commits", "Why: it refused another commit."
-            commit_without_files(commits, [[title], [why]], [("Operation", "follow")], now)
+            commits.commit_without_files([[title], [why]], [("Operation", "follow")], now)
         self._publish_commits(commits)
         return None
 
