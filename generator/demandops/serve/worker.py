@@ -245,9 +245,10 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > agenda.LONGEST_EVALUATION_S
+            is_long = len(json.dumps(ticket.demand.goal)) > agenda.USUAL_LENGTH
             # it may release a demand of this batch, which must be proposed first
-            is_late |= ticket.demand.is_release and any(isinstance(r, Decision) for _, r in results)
-            if number and (is_late or len(json.dumps(ticket.demand.goal)) > agenda.USUAL_LENGTH):
+            proposes = any(isinstance(result, Decision) for _, result in results)
+            if number and (is_late or is_long or (ticket.demand.is_release and proposes)):
                 part, left = part[:number], part[number:] + left
                 break
             results.append(self._evaluate(commits, ticket))
@@ -331,8 +332,7 @@ class Worker:
                     ),
                     agenda.within(state.config.repo_settings.limits, self._runtime),
                 )
-            if self._approvals.proposals:
-                self._approvals.refuse_strangers(decision)
+            self._approvals.refuse_strangers(decision)
             if decision.approval:
                 return decision
             # from here on the demand can no longer be taken back
