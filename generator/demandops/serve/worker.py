@@ -332,7 +332,8 @@ class Worker:
                     ),
                     agenda.within(state.config.repo_settings.limits, self._runtime),
                 )
-            self._approvals.refuse_strangers(decision)
+            if self._approvals.proposals:
+                self._approvals.refuse_strangers(decision)
             if decision.approval:
                 return decision
             # from here on the demand can no longer be taken back

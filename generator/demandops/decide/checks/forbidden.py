@@ -112,6 +112,8 @@ def _matched_field(selector: Selector, item: Item, config: Config) -> str:
 
 def warnings(request: Demand, world: World) -> Iterator[str]:
     """Yield a warning for each suspended claim of the requesters that a demand holds or lists."""
+    if not any(override.deny for override in world.overrides):
+        return
     claims = [
         *world.ledger.claims_with("demand", request.demand),
         *(claim for subject in request.subjects() for claim in world.ledger.claims_on(subject)),
