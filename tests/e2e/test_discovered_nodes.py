@@ -9,7 +9,7 @@ import yaml
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.nodes import ClusterNodes
 from demandops.decide.discovery import ClusterNode
-from demandops.serve import agenda
+from demandops.serve import node_discovery
 from kubernetes.client import CoreV1Api
 
 from tests.e2e.common.access import limited
@@ -119,7 +119,7 @@ class Looking:
         """Let minutes pass until the file is as it must be."""
 
         def look() -> object:
-            self.clock.pass_(agenda._NODES_PAUSE_S)
+            self.clock.pass_(node_discovery._PAUSE_S)
             text = read(self._bare, FILE)
             return text and seen({node["id"]: node for node in plain_yaml.load(text)["nodes"]})
 
@@ -146,7 +146,7 @@ def test_a_thousand_nodes_and_what_a_decision_sees_of_them(
     for ready in (False, True):
         for number in range(0, MANY, 4):
             fleet.flap(number, ready=ready)
-        looking.clock.pass_(agenda._NODES_PAUSE_S)
+        looking.clock.pass_(node_discovery._PAUSE_S)
     fleet.cordon(500)  # a watch tells all in order
     looking.until(lambda nodes: "drained" in nodes["bus0500"])
 

@@ -23,10 +23,11 @@ from demandops.repo.load.ledger_files import restoration
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve import agenda
-from demandops.serve.agenda import Agenda, Backoff, NodeDiscovery, NodesOf, RateLimit, What
+from demandops.serve.agenda import Agenda, Backoff, RateLimit, What
 from demandops.serve.approvals import Approvals, Result
 from demandops.serve.demands import Demands
 from demandops.serve.journal import Receipt, Ticket
+from demandops.serve.node_discovery import NodeDiscovery, NodesOf
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 log = logging.getLogger("demandops")

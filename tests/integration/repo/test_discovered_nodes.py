@@ -13,7 +13,7 @@ from demandops.decide.discovery import ClusterNode
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.repo.load.snapshot import follow
-from demandops.serve import agenda
+from demandops.serve import node_discovery
 from demandops.serve.generator import Generator
 
 from tests.kit import plain_yaml, rig
@@ -42,10 +42,12 @@ class Cluster:
     def __init__(self, bare: Path, clock: Clock) -> None:
         self._bare, self._clock = bare, clock
         self.nodes: dict[str, ClusterNode] = {}
+        self.of_other: dict[str, ClusterNode] = {}
         self.is_known = True
 
     def __call__(self, config: Config) -> Mapping[str, Sequence[ClusterNode]]:
-        return {"c-its": [*self.nodes.values()]} if self.is_known else {}
+        known = {"c-its": [*self.nodes.values()], "other": [*self.of_other.values()]}
+        return {name: known[name] for name in config.clusters if self.is_known}
 
     def add(self, *ids: str, cordoned: bool = False, role: str = "vehicle", **more: str) -> None:
         for id in ids:
@@ -60,12 +62,15 @@ class Cluster:
     def change(self, after_s: float) -> None:
         """Have the cluster say that its nodes changed, and let time pass."""
         self.generator.nodes_changed()
+        self.wait(after_s)
+
+    def wait(self, after_s: float) -> None:
         self._clock.pass_(after_s)
         assert rig.outcome(self.generator.submit(put("none", node="nowhere"))) == "unknown-node"
 
     def look(self) -> None:
         """Have the generator look at the nodes, a minute after the last time."""
-        self.change(agenda._NODES_PAUSE_S + agenda._GATHER_S)
+        self.change(node_discovery._PAUSE_S + node_discovery._GATHER_S)
 
     @property
     def state(self) -> State:
@@ -107,9 +112,10 @@ def cluster(bare: Path, person: Person, clock: Clock) -> Iterator[Cluster]:
 
 
 def test_all_nodes_come_in_one_commit_and_take_demands(cluster: Cluster, bare: Path) -> None:
-    cluster.add(*(f"bus{n}" for n in range(60)))
+    cluster.add(*(f"bus{n}" for n in range(60)), "bus-60")  # no topic may have this name
     cluster.look()
     assert cluster.discoveries == 1
+    assert "bus-60" not in cluster.listed
     assert cluster.listed["bus7"] == {"id": "bus7", "type": "vehicle", "capacity": {"cpu": "4"}}
     message = cluster.newest
     assert message.startswith("Nodes of c-its: 60 came\n\nWhy: c-its said so.\n")
@@ -125,7 +131,7 @@ def test_what_changes_within_a_minute_shares_a_commit(cluster: Cluster, bare: Pa
     cluster.look()
     for id in ("bus0", "bus1"):
         cluster.add(id, cordoned=True)
-        cluster.change(agenda._GATHER_S + 1)
+        cluster.change(node_discovery._GATHER_S + 1)
     assert cluster.discoveries == 1
     cluster.look()
     assert cluster.discoveries == 2
@@ -175,6 +181,27 @@ def test_a_cordon_moves_what_was_placed(cluster: Cluster, bare: Path) -> None:
     cluster.look()
     assert cluster.home("edge/d") == "rack1"
     assert cluster.operations[-2:] == ["discover", "drain"]
+    assert_sound(bare)
+
+
+def test_a_node_moves_to_another_cluster_when_it_has_left_the_first(
+    cluster: Cluster, bare: Path, person: Person, clock: Clock
+) -> None:
+    person.change({CLUSTERS: f"{FROM_CLUSTER}  - {{name: other, nodes: from-cluster}}\n"})
+    cluster.generator.fetch_now()
+    cluster.add("bus0")
+    cluster.of_other |= cluster.nodes  # both are new, but only one can be the node
+    cluster.look()
+    assert git(bare, "grep", "-l", "bus0", "main", "--", "inventory/discovered").split() == [
+        f"main:{FILE}"
+    ]
+    cluster.nodes.clear()
+    cluster.look()
+    clock.pass_(600)
+    cluster.look()
+    assert cluster.listed == {}
+    cluster.wait(node_discovery._PAUSE_S)
+    assert cluster.state.config.nodes["bus0"].cluster == "other"
     assert_sound(bare)
 
 
@@ -282,8 +309,8 @@ def test_a_node_of_a_pattern_becomes_the_one_of_the_cluster(
     cluster.generator.fetch_now()
     cluster.book("bus0")
     assert cluster.state.config.nodes["bus0"].type == "bus"
-    cluster.add("bus0", role="tram")
+    cluster.add("bus0", "bus1", role="tram")
     cluster.look()
-    assert cluster.state.config.nodes["bus0"].type == "tram"
+    assert {cluster.state.config.nodes[id].type for id in ("bus0", "bus1")} == {"tram"}
     assert "~ " in cluster.newest.partition("Desired state:")[2]
     assert_sound(bare, verify_last=3)
