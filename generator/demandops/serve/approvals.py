@@ -341,11 +341,7 @@ class Approvals:
     def _has_moved(
         proposal: Proposal, commits: tuple[str, ...], head: str, heads: BranchHeads
     ) -> bool:
-        """Return whether this check has moved or removed the branch.
-
-        A person may have merged the branch just before, which only a main shows that is read after
-        that. So the next check answers.
-        """
+        # by this check: a person may have merged it just before, which only a later main shows
         is_there = heads.branches.get(proposal.branch, "") == head
         return not is_there or proposal.record.commits != commits
 

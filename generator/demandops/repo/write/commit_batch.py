@@ -142,7 +142,7 @@ class CommitBatch:
         The commit also says which configuration is in effect, if that has changed.
         """
         self.head, before, change = followed.snapshot, followed.before, followed.change
-        if not followed.must_commit:
+        if not change.files and self.head.is_told:
             return
         overrides = edits.changed_override_files(before.state, self.head.state)
         of_overrides = commit_message.override_trailers(
