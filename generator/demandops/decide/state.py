@@ -317,6 +317,8 @@ def effect_on_pods(
     if was == now:  # only comments differ, which name overrides
         return ""
     live = {*new.service.live, *_ALWAYS_LIVE} if isinstance(new, ServiceRelease) else set()
+    if "restart" in now.get("reconfigure", ""):  # of the library, by a template or an override
+        live.discard("parameters")
     differing = {name for name in {**was, **now} if was.get(name, ABSENT) != now.get(name, ABSENT)}
     return "reconfigures" if differing <= live else "restarts"
 
