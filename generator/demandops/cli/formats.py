@@ -45,16 +45,13 @@ class _Format(click.Choice[str]):
 
 def output_formats(*formats: str) -> Callable[[Command], Command]:
     # with ``--output json``, a command that raises DemandOpsError also prints the faults as JSON
-    description = "The output format."
-    if "markdown" in formats:
-        description = "The output format; markdown is for a comment on a pull request."
     option = click.option(
         "-o",
         "--output",
         type=_Format(formats),
         default="text",
         show_default=True,
-        help=description,
+        help="The output format.",
     )
 
     def add(command: Command) -> Command:

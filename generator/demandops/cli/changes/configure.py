@@ -117,14 +117,11 @@ def _new_name(name: str) -> str:
     )
 
 
-def _image(ctx: click.Context, param: click.Parameter, given: tuple[str, ...]) -> Json | None:
-    pins: Json = {}
-    for text in given:
-        name, _, pin = text.partition("=")
-        if not (name and pin):
-            raise click.BadParameter(f"{quoted(text)} is not NAME=TAG or NAME=sha256:DIGEST")
-        pins[name] = {"digest" if pin.startswith("sha256:") else "tag": pin}
-    return pins or None
+def _image(text: str) -> tuple[str, Json]:
+    name, _, pin = text.partition("=")
+    if not (name and pin):
+        raise ValueError(f"{quoted(text)} is not NAME=TAG or NAME=sha256:DIGEST")
+    return name, {"digest" if pin.startswith("sha256:") else "tag": pin}
 
 
 @override.command()
@@ -149,7 +146,7 @@ def _image(ctx: click.Context, param: click.Parameter, given: tuple[str, ...]) -
     "images",
     metavar="NAME=TAG",
     multiple=True,
-    callback=_image,
+    callback=read_by(_image),
     help="Pin an image of registry/images to a tag or digest.",
 )
 @click.option(
@@ -188,6 +185,7 @@ def create(name: str, values: str | None, options: Options, **given: Any) -> Non
         if not isinstance(patch, dict):
             raise InvalidInput.at("", "must be a mapping of Helm values", file=file)
     selected = {f"{name}s": given.pop(f"{name}s") for name in SELECTED}
+    given["images"] = dict(given["images"]) or None
     # a flag that is not given is no effect
     more = {field: value for field, value in given.items() if value is not False}
     _create(name, f"Create override {name}", selected, {"values": patch, **more}, options)
