@@ -15,7 +15,12 @@ from demandops.base.runtime import REAL
 from demandops.cluster.watches import ConfigMapWatch
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterEvent
-from rcl_interfaces.srv import GetParameters, GetParameterTypes, SetParametersAtomically
+from rcl_interfaces.srv import (
+    DescribeParameters,
+    GetParameters,
+    GetParameterTypes,
+    SetParametersAtomically,
+)
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -65,6 +70,9 @@ _ANSWER_S = 2.0  # a node that does not answer for so long has ended
 # A node may refuse what it takes later, such as a lifecycle node that declares its parameters when
 # it is configured.
 _REFUSED_S = 5.0
+# In the memory, the type of what a node declared without a value. It has nothing to go back to, and
+# to unset it would take it from the node.
+_NO_VALUE = 255
 
 
 def as_the_node_has_it(name: str, value: Any, kind: int) -> Parameter:  # noqa: ANN401
@@ -92,13 +100,15 @@ class ParameterSetter:
     """Sets the parameters of the node ``target`` to those of the last call of :meth:`want`.
 
     The node takes all of them or none. A parameter that is wanted no more gets back what it had
-    before it was set first. ``problem`` is why the node does not have them; empty if it has.
+    before it was set first, if that was a value. ``problem`` is why the node does not have them;
+    empty if it has.
     """
 
     def __init__(
         self, node: Node, target: str, on_answer: Callable[[], None], state_file: Path
     ) -> None:
         self._node = node
+        self._describe = node.create_client(DescribeParameters, f"{target}/describe_parameters")
         self._types = node.create_client(GetParameterTypes, f"{target}/get_parameter_types")
         self._get = node.create_client(GetParameters, f"{target}/get_parameters")
         self._set = node.create_client(
@@ -106,7 +116,7 @@ class ParameterSetter:
         )
         self._target = str(node.resolve_service_name(target))
         self._on_answer = on_answer
-        self.problem = f"{self._target} has not answered yet"
+        self.problem = self._unanswered = f"{self._target} has not answered yet"
         self._lock = REAL.lock()
         self._wanted: Mapping[str, Any] = {}
         self._version = 0
@@ -117,8 +127,12 @@ class ParameterSetter:
         if state_file.is_char_device():
             self._memory = None
         elif self._memory.exists():
-            kept = deserialize_message(self._memory.read_bytes(), ParameterEvent)
-            self._before = {each.name: each for each in kept.changed_parameters}
+            try:
+                kept = deserialize_message(self._memory.read_bytes(), ParameterEvent)
+                self._before = {each.name: each for each in kept.changed_parameters}
+            except Exception as error:  # a power cut may leave it empty, and rclpy says so oddly
+                told = f"{self._memory} is not used, as it cannot be read: {error}"
+                node.get_logger().warning(one_line(told))
         # the target's endpoints when it last answered, and the version of these parameters
         self._answered: tuple[Any, int] | None = None
         self._call: tuple[Any, Any] | None = None  # the client, and the future of its answer
@@ -142,62 +156,91 @@ class ParameterSetter:
         )
         with self._lock:
             wanted, version = self._wanted, self._version
-        now = REAL.monotonic()
+        now, is_answered = REAL.monotonic(), self._answered == (endpoints, version)
+        if not (is_answered or self.problem):  # a new version, or the node is gone or new
+            self.problem = self._unanswered
+            self._on_answer()
         if self._call is not None:
             if now - self._called_at < _ANSWER_S:
                 return
             client, future = self._call
             client.remove_pending_request(future)
             self._call = None
-        is_answered = self._answered == (endpoints, version)
         if is_answered and not (self.problem and now - self._answered_at >= _REFUSED_S):
             return
-        clients = (self._types, self._get, self._set)
+        clients = (self._describe, self._types, self._get, self._set)
         if version == 0 or not endpoints or not all(c.service_is_ready() for c in clients):
             return
+        self._begin(wanted, (endpoints, version), is_new=not is_answered)
+
+    def _begin(self, wanted: Mapping[str, Any], asked_at: tuple[Any, int], *, is_new: bool) -> None:
+        # four calls, each after the answer of the one before
         before = self._before
+        kinds = dict.fromkeys(wanted, 0)
+        declared, hints = set[str](), list[str]()
+
+        def take_descriptions(response: Any) -> None:  # noqa: ANN401
+            # none at all if the node lacks one of the parameters, which it then refuses
+            for name, described in zip(wanted, response.descriptors, strict=False):
+                kinds[name] = described.type
+                if described.type or described.dynamic_typing:
+                    declared.add(name)
+            if wanted and not response.descriptors:
+                hints.append(f"it has not declared all of {', '.join(wanted)}")
+            self._ask(self._types, GetParameterTypes.Request(names=[*wanted]), take_types)
 
         def take_types(response: Any) -> None:  # noqa: ANN401
-            # none at all if the node lacks one of the parameters, which it then refuses by name
-            kinds = dict(zip(wanted, [*response.types, *[0] * len(wanted)], strict=False))
-            new = [name for name in wanted if name not in before] if response.types else []
+            types = dict(zip(wanted, response.types, strict=False))
+            kinds.update((name, kind) for name, kind in types.items() if kind)
+            new = [name for name in types if name not in before]
             # only those with a value, because a node gives none at all if one has none
-            asked = [name for name in new if kinds[name]]
+            asked = [name for name in new if types[name]]
 
             def take_values(response: Any) -> None:  # noqa: ANN401
                 if len(response.values) == len(asked):
                     noted = {name: ParameterMessage(name=name) for name in new}
+                    for name in declared & noted.keys():
+                        noted[name].value.type = _NO_VALUE
                     for name, value in zip(asked, response.values, strict=True):
                         noted[name].value = value
                     self._remember(before | noted)
                 parameters = [
-                    as_the_node_has_it(name, value, kinds[name]).to_parameter_msg()
-                    for name, value in wanted.items()
+                    as_the_node_has_it(name, value, kinds[name]) for name, value in wanted.items()
                 ]
-                parameters += [each for name, each in before.items() if name not in wanted]
-                request = SetParametersAtomically.Request(parameters=parameters)
+                hints.extend(
+                    f"{each.name} is {_KINDS(kind).name} there, not {each.type_.name}"
+                    for each in parameters
+                    if (kind := kinds[each.name]) not in (0, each.type_.value)
+                )
+                given = [each.to_parameter_msg() for each in parameters]
+                given += [
+                    each
+                    for name, each in before.items()
+                    if name not in wanted and each.value.type != _NO_VALUE
+                ]
+                request = SetParametersAtomically.Request(parameters=given)
                 self._ask(self._set, request, take_result)
 
             self._ask(self._get, GetParameters.Request(names=asked), take_values)
 
         def take_result(response: Any) -> None:  # noqa: ANN401
             result, problem = response.result, self.problem
-            self._answered, self._answered_at = (endpoints, version), REAL.monotonic()
+            self._answered, self._answered_at = asked_at, REAL.monotonic()
             self.problem = ""
             if result.successful:
                 self._remember({k: each for k, each in self._before.items() if k in wanted})
             else:
                 self._remember(before)
-                reason = result.reason or "no reason given"
+                reason = "; ".join([result.reason or "no reason given", *hints])
                 self.problem = one_line(f"{self._target} refused its parameters: {reason}")
-            if self.problem and (self.problem != problem or not is_answered):
+            if self.problem and (self.problem != problem or is_new):
                 self._node.get_logger().error(self.problem)
             elif not self.problem:
                 self._node.get_logger().info(f"set {len(wanted)} parameters of {self._target}")
             self._on_answer()
             self._changed.trigger()  # other parameters may be wanted by now
 
-        self._ask(self._types, GetParameterTypes.Request(names=[*wanted]), take_types)
+        self._ask(self._describe, DescribeParameters.Request(names=[*wanted]), take_descriptions)
 
     def _remember(self, before: dict[str, Any]) -> None:
         if before != self._before and self._memory:

@@ -12,24 +12,6 @@ from tests.kit.http import kubeconfig
 from tests.kit.repo import GitRepo
 
 
-def test_options_that_are_not_given_are_asked_for(checkout: Path) -> None:
-    asked = [
-        ("such as camera=sensor_msgs/msg/Image; separate several by spaces: ", "camera"),
-        ("Error: 'camera' is not ROLE=TYPE; write it like", "camera=sensor_msgs/Image"),
-        ("write camera=sensor_msgs/msg/Image", ""),
-        ("Error: an answer is needed; Ctrl-C ends the command", "camera=sensor_msgs/msg/Image"),
-        ("such as detector=my_package/detector; separate", "tracker=tracking/tracker"),
-        ("with a tag or digest, such as ", "ghcr.io/me/tracking:1.0"),
-    ]
-    with Dialogue("new", "application", "tracking", folder=checkout) as talk:
-        for text, answer in asked:
-            talk.read_until(text)
-            talk.type(f"{answer}\n")
-        assert talk.end() == 0, talk.text
-    assert "to check the files: demandops check" in talk.text
-    assert (checkout / "appdefs" / "tracking" / "values" / "tracker.yaml.j2").is_file()
-
-
 @pytest.mark.nightly  # sees whole seconds pass
 def test_a_cluster_that_does_not_answer_is_waited_for_until_ctrl_c_or_a_time_has_passed(
     state: GitRepo, tmp_path: Path

@@ -1,7 +1,4 @@
-"""The output of commands: tables for people, JSON for programs, errors and progress on stderr.
-
-Functions that need `rich` import it themselves, because `demandops --help` imports this module.
-"""
+"""The output of commands: text and its pager, errors and progress on stderr, and the streams."""
 
 from __future__ import annotations
 
@@ -12,34 +9,16 @@ import sys
 import textwrap
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from demandops.base import quoting
 from demandops.base.runtime import REAL
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.text import Text
-
 _MOST_LISTED = 3
 
 Progress = Callable[[int, int], None]
-
-
-def console(stderr: bool = False) -> Console:
-    from rich.console import Console  # noqa: PLC0415
-
-    class QuotingConsole(Console):
-        def render_str(self, text: str, **how: Any) -> Text:  # noqa: ANN401 - as rich has it
-            return super().render_str(quoting.lines(text), **how)
-
-    # elsewhere than on a terminal, a program may read the lines, so they are not wrapped
-    stream = sys.stderr if stderr else sys.stdout
-    width = None if stream.isatty() else 200
-    # rich would take [bold] and :smile: in the texts of people for its own markup
-    return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
 # What the command has changed already, to be told if its output cannot be written.
@@ -102,6 +81,10 @@ def painted(text: str, style: str) -> str:
     return click.style(text, fg=style)
 
 
+def say(text: str) -> None:
+    click.echo(quoting.lines(text))
+
+
 def print_lines(lines: list[str]) -> None:
     text = "".join(f"{line}\n" for line in lines)
     is_long = len(lines) >= shutil.get_terminal_size().lines
@@ -152,9 +135,9 @@ at_option = click.option(
 
 
 def read_by(parse: Callable[[str], Any]) -> Callable[..., Any]:
-    def value(ctx: click.Context, param: click.Parameter, text: str) -> Any:  # noqa: ANN401
+    def value(ctx: click.Context, param: click.Parameter, given: Any) -> Any:  # noqa: ANN401
         try:
-            return parse(text)
+            return tuple(map(parse, given)) if isinstance(given, tuple) else parse(given)
         except ValueError as error:
             raise click.BadParameter(str(error)) from None
 
@@ -168,36 +151,26 @@ def show_slow(text: str) -> None:  # an empty text clears the line
 
 
 @contextmanager
-def busy(title: str) -> Iterator[None]:
-    # on a terminal, the title and the elapsed seconds, if the block takes a second or longer
-    ended = REAL.event()
+def busy(title: str) -> Iterator[Progress]:
+    # on a terminal, the title, how far the block says that it is, and the elapsed seconds, if it
+    # takes a second or longer
+    ended, reached = REAL.event(), ""
+
+    def report(done: int, total: int) -> None:
+        nonlocal reached
+        reached = f", {done} of {total}"
 
     def tick() -> None:
         seconds = 0
         while not ended.wait(1):
             seconds += 1
-            show_slow(f"{title}, {seconds} s")
+            show_slow(f"{title}{reached}, {seconds} s")
 
     thread = REAL.start_thread("busy", tick) if sys.stderr.isatty() else None
     try:
-        yield
+        yield report
     finally:
         ended.set()
         if thread is not None:
             thread.join()
             show_slow("")
-
-
-@contextmanager
-def progress(title: str) -> Iterator[Progress]:
-    # on a terminal, how far the work is, if it takes long
-    start = REAL.monotonic()
-
-    def report(done: int, total: int) -> None:
-        if REAL.monotonic() - start >= 0.5:
-            show_slow(f"{title}, {done} of {total}")
-
-    try:
-        yield report
-    finally:
-        show_slow("")

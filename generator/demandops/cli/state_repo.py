@@ -15,7 +15,7 @@ from demandops.base.runtime import REAL
 from demandops.cli import target
 from demandops.cli.authoring import schema
 from demandops.cli.formats import output_option, show
-from demandops.cli.output import busy, done, errors, progress
+from demandops.cli.output import busy, done, errors
 from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
@@ -190,14 +190,14 @@ def upgrade(
     now = REAL.now()
     signer = Signer(signing_key) if signing_key and not dry_run else None
     if dry_run or asks:
-        with progress("reading the ledger") as report:
+        with busy("reading the ledger") as report:
             result = upgrading.plan(state_repo, request, now, report)
     if asks and not dry_run and result.switches:
         show(output, None, [_SWITCH])
         if not click.confirm("Are those before it done?"):
             raise click.ClickException("nothing was changed; do these steps first, or give --yes")
     if not dry_run:
-        with progress("reading the ledger") as report:
+        with busy("reading the ledger") as report:
             result = upgrading.upgrade(state_repo, request, now, report, signer)
             done.extend([f"upgraded in {result.commit}"] if result.files else [])
     old, new = result.old.repo_settings, result.new.repo_settings
@@ -286,7 +286,7 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     with (
         processor_time(each=60),
         reader.opened(state_repo) as repo,
-        progress("rendering again") as report,
+        busy("rendering again") as report,
     ):
         verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
     rows: list[Json] = []

@@ -81,11 +81,13 @@ def discover(
     before: str | None,
     now: datetime,
     files: Mapping[str, str],
+    unfit: Mapping[str, object],
     is_needed: Callable[[str], bool],
 ) -> Discovered:
     """Return the file of a cluster after ``before``, given all its nodes.
 
-    ``files`` has the file of each node by id, and ``is_needed`` says whether a node must stay yet.
+    ``files`` has the file of each node by id, ``unfit`` why a node of an id cannot be as the
+    cluster has it, and ``is_needed`` says whether a node must stay yet.
     """
     path, discovery = path_of(cluster.name), cluster.discovery or Discovery()
     known, problems = {node.id: node for node in read(before, path)}, list[str]()
@@ -96,7 +98,10 @@ def discover(
     for id, sources in sorted(by_id.items()):
         source, old = sources[0], known.get(id)
         file = files.get(id, path)
-        if why := _refused(id, sources, is_taken=file != path and is_discovered(file)):
+        why = _refused(id, sources, is_taken=file != path and is_discovered(file))
+        if not why and id in unfit:
+            why = f"node '{id}' is not taken over as the cluster has it: {unfit[id]}"
+        if why:
             problems.append(why)
             nodes |= {id: old} if old else {}
             continue
@@ -109,7 +114,7 @@ def discover(
             changed.append(f"{id}: {', '.join(differing)}")
     keeps = timedelta(seconds=seconds_of(discovery.gone_after))
     for id in sorted(known.keys() - nodes.keys()):
-        since = known[id].gone_since or now
+        since = min(known[id].gone_since or now, now)  # the clock may have been set back
         if now - since >= keeps and not is_needed(id):
             left.append(f"{id}: taken out, as the cluster has not had it since {time_text(since)}")
             continue

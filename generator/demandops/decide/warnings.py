@@ -414,6 +414,10 @@ def policy_warnings(world: State) -> Iterator[Fault]:
     yield from _approvals_not_needed(config)
     yield from _open_by_host_network(config)
     yield from _connections_no_longer_allowed(world)
+    for id in sorted(config.nodes.keys() - config.domain_of.keys()):  # for a listed one, a fault
+        if problem := config.unlisted.of_several_domains(id):
+            message = f"{quoted(id)} {problem}, as until then it is in none"
+            yield fault("", message).within(config.place_of(DOMAINS_FILE))
     for (id, resource), used in sorted(world.usage().amounts.items()):
         node = config.nodes.get(id)
         most = node.most(resource) if node else None

@@ -11,7 +11,7 @@ from demandops.base.runtime import Runtime
 from demandops.decide.discovery import ClusterNode, Discovered, discover
 from demandops.decide.state import State
 from demandops.model.config.config import NODES_FILE, Config
-from demandops.model.config.discovered import DISCOVERED_ROOT, path_of
+from demandops.model.config.discovered import DISCOVERED_ROOT, InvalidConfig, path_of
 from demandops.repo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
@@ -32,7 +32,7 @@ class NodeDiscovery:
     def __init__(self, nodes_of: NodesOf, runtime: Runtime) -> None:
         self._nodes_of, self._runtime = nodes_of, runtime
         self._config: Config | None = None
-        self._news_at, self._next_at, self._has_gone = inf, -inf, False
+        self._news_at, self._next_at, self._awaits_claims = inf, -inf, False
         self._told: frozenset[str] = frozenset()
 
     def has_news(self) -> None:
@@ -41,8 +41,8 @@ class NodeDiscovery:
     def due_in(self, state: State) -> float:
         now = self._runtime.monotonic()
         at = now if state.config is not self._config else self._news_at + _GATHER_S
-        # claims on a node that is gone may end at any time
-        at = min(at, self._next_at) if self._has_gone else at
+        # claims on a node that is gone, or of a pattern until now, may end at any time
+        at = min(at, self._next_at) if self._awaits_claims else at
         return max(0.0, max(at, self._next_at) - now)
 
     def commit_due(self, commits: CommitBatch) -> None:
@@ -57,22 +57,32 @@ class NodeDiscovery:
         if commits.head.faults:  # an earlier configuration is in effect, as a whole
             self.has_news()
             return
-        problems, failure = list[str](), None
-        # what people wrote may name a node that is to leave; if so, all stay
-        for may_leave in (True, False):
-            found = _found(state, seen, texts, self._runtime, may_leave=may_leave)
-            self._has_gone = any(each.has_gone for each in found)
+        problems, unfit, may_leave = list[str](), dict[str, object](), True
+        while True:
+            found = _found(state, seen, texts, self._runtime, unfit, may_leave=may_leave)
+            is_claimed = any(state.ledger.claims_needing(id) for id in unfit)
+            self._awaits_claims = is_claimed or any(each.has_gone for each in found)
             problems = [problem for each in found for problem in each.problems]
             differing = [each for each in found if each.text != texts.get(each.path)]
             try:
                 if differing:
+                    # another look follows: what left here, another cluster may have
                     commits.take_over(differing, self._runtime.now())
-                    self._config = commits.head.state.config
                 break
             except InvalidInput as error:
-                failure = f"the nodes of clusters stay as they are: {error.faults[0]}"
-        else:
-            problems.append(failure or "")
+                new = (id for each in differing for id in each.new_ids)
+                claimed = (id for id in new if state.ledger.claims_needing(id))  # of a pattern
+                of_nodes: dict[str, object] = dict.fromkeys(claimed, error.faults[0])
+                if isinstance(error, InvalidConfig):
+                    of_nodes = error.of_nodes
+                if of_nodes.keys() - unfit.keys():  # one node must not hold up the others
+                    unfit |= of_nodes
+                elif may_leave:  # people's files may name a node that is to leave; if so, all stay
+                    may_leave = False
+                    unfit.clear()
+                else:
+                    problems.append(f"the nodes of clusters stay as they are: {error.faults[0]}")
+                    break
         for problem in sorted({*problems} - self._told):
             log.warning("%s", problem)
         self._told = frozenset(problems)
@@ -83,11 +93,12 @@ def _found(
     seen: Mapping[str, Sequence[ClusterNode]],
     texts: Mapping[str, str],
     runtime: Runtime,
+    unfit: Mapping[str, object],
     *,
     may_leave: bool,
 ) -> list[Discovered]:
     config, now = state.config, runtime.now()
-    files = config.entry_files[NODES_FILE]
+    files = {**config.entry_files[NODES_FILE]}
 
     def is_needed(id: str) -> bool:
         nodes = config.nodes_of(id)
@@ -99,5 +110,8 @@ def _found(
     for path, cluster in asked.items():
         if cluster.name in seen:
             nodes = seen[cluster.name]
-            found.append(discover(cluster, nodes, texts.get(path), now, files, is_needed))
+            before = texts.get(path)
+            found.append(discover(cluster, nodes, before, now, files, unfit, is_needed))
+            for id in found[-1].new_ids:  # another cluster may have it too, as new
+                files.setdefault(id, path)
     return found

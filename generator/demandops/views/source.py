@@ -8,7 +8,6 @@ from datetime import datetime
 from typing import Any, Generic, TypeVar
 
 from demandops.base.errors import DemandOpsError
-from demandops.base.naming import SubjectKind
 from demandops.base.runtime import REAL
 from demandops.cluster.health import (
     ClusterDomain,
@@ -178,37 +177,25 @@ class Source:
         subjects = [*dict.fromkeys(subject_before.get(id) or subject_now[id] for id in differing)]
         changes = changes_on(old.ledger, new.ledger, subjects)
         keys: set[ReleaseKey] = {*affected_keys(old, new, changes)}
-        for was, now in ((change.before, change.after) for change in changes):
-            # the views show requesters, but `affected_keys` omits a release whose file stays the
-            # same although its requesters changed
-            if was and now and was.requesters != now.requesters:
-                keys.update(keys_of_claims(self.active, [now]))
         # what is planned as before may be needed by other claims
-        gone: set[int] = set()
-        fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
-        for subject in subjects:
-            claims = self.active.ledger.claims_on(subject)
-            ids_before = {id(claim) for claim in before.active.ledger.claims_on(subject)}
-            gone |= ids_before - {id(claim) for claim in claims}
-            fresh[subject.kind][subject.id] = [
-                claim for claim in claims if id(claim) not in ids_before
-            ]
-        planned = {**before.planned}
-        for key, earlier in before.planned.items():
-            if earlier is None:
-                continue
-            release = earlier.release
-            if isinstance(release, ServiceRelease):
-                kind, ids = SubjectKind.APPLICATION, release.applications
-            else:
-                kind, ids = SubjectKind.CONNECTION, release.connections
-            if fresh[kind].keys().isdisjoint(ids):
-                continue
-            kept = [claim for claim in earlier.claims if id(claim) not in gone]
-            added = [claim for id in ids for claim in fresh[kind].get(id, ())]
-            needing = [claim for claim in added if needs(claim, release)]
-            if needing or len(kept) < len(earlier.claims):
-                planned[key] = replace(earlier, claims=by_booking([*kept, *needing]))
+        needing: dict[ReleaseKey, list[Claim]] = {}
+        for change in changes:
+            was, now = before.active.ledger.get(change.key), self.active.ledger.get(change.key)
+            if was:
+                for key in keys_of_claims(before.active, [was]):
+                    needing.setdefault(key, [])
+            if now:
+                for key in keys_of_claims(self.active, [now]):
+                    needing.setdefault(key, []).append(now)
+                    # the views show requesters, but `affected_keys` omits a release whose file
+                    # stays the same although its requesters changed
+                    if was and was.requesters != now.requesters:
+                        keys.add(key)
+        planned, changed = {**before.planned}, {change.key for change in changes}
+        for key, claims in needing.items():
+            if earlier := planned.get(key):
+                kept = [claim for claim in earlier.claims if claim.key not in changed]
+                planned[key] = replace(earlier, claims=by_booking([*kept, *claims]))
         for key in keys:
             planned.pop(key, None)
             if (anew := self._plan(key)) or denied_release(new, key):
@@ -257,17 +244,13 @@ class Source:
         return sorted(running, key=lambda each: (each.target.domain.cluster, each.target.name))
 
     @_Derived
-    def targets(self) -> list[tuple[Release, Target]]:
-        return [(planned.release, planned.target) for planned in self.running]
-
-    @_Derived
     def denied(self) -> list[tuple[Release, Override]]:
         keys = (key for key, planned in self.planned.items() if planned is None)
         return [denied for key in keys if (denied := denied_release(self.state, key))]
 
     @_Derived
     def releases(self) -> dict[str, Release]:
-        return {release.name: release for release, _ in self.targets}
+        return {planned.release.name: planned.release for planned in self.running}
 
     @_Derived
     def overrides(self) -> list[Entry]:
@@ -324,7 +307,7 @@ class Source:
         self, caches: Mapping[str, ObjectCache], history: History, changed: ChangedPaths
     ) -> Source:
         """Add what clusters report, as read into their caches."""
-        targets, domains = [target for _, target in self.targets], self.domains
+        targets, domains = [planned.target for planned in self.running], self.domains
         reported = statuses(targets, self.commit, caches, history, changed)
         unread = {
             name: cache.why_unknown(self.watched_objects.get(name, ()))
@@ -349,7 +332,9 @@ class Source:
     def watched_objects(self) -> dict[str, list[ObjectSelector]]:
         """The objects that tell the health of the releases, by cluster."""
         wanted: dict[str, dict[ObjectSelector, None]] = {}
-        for domain in dict.fromkeys((*(t.domain for _, t in self.targets), *self.domains)):
+        for domain in dict.fromkeys(
+            (*(planned.target.domain for planned in self.running), *self.domains)
+        ):
             watched = health_reader(domain).objects_to_watch(domain)
             wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
         return {cluster: [*selectors] for cluster, selectors in wanted.items()}
@@ -359,5 +344,5 @@ class Source:
 
     @property
     def unwatched(self) -> list[str]:
-        used = {target.domain.cluster for _, target in self.targets}
+        used = {planned.target.domain.cluster for planned in self.running}
         return sorted(used - self.watched)

@@ -42,10 +42,12 @@ class Cluster:
     def __init__(self, bare: Path, clock: Clock) -> None:
         self._bare, self._clock = bare, clock
         self.nodes: dict[str, ClusterNode] = {}
+        self.of_other: dict[str, ClusterNode] = {}
         self.is_known = True
 
     def __call__(self, config: Config) -> Mapping[str, Sequence[ClusterNode]]:
-        return {"c-its": [*self.nodes.values()]} if self.is_known else {}
+        known = {"c-its": [*self.nodes.values()], "other": [*self.of_other.values()]}
+        return {name: known[name] for name in config.clusters if self.is_known}
 
     def add(self, *ids: str, cordoned: bool = False, role: str = "vehicle", **more: str) -> None:
         for id in ids:
@@ -60,6 +62,9 @@ class Cluster:
     def change(self, after_s: float) -> None:
         """Have the cluster say that its nodes changed, and let time pass."""
         self.generator.nodes_changed()
+        self.wait(after_s)
+
+    def wait(self, after_s: float) -> None:
         self._clock.pass_(after_s)
         assert rig.outcome(self.generator.submit(put("none", node="nowhere"))) == "unknown-node"
 
@@ -107,9 +112,10 @@ def cluster(bare: Path, person: Person, clock: Clock) -> Iterator[Cluster]:
 
 
 def test_all_nodes_come_in_one_commit_and_take_demands(cluster: Cluster, bare: Path) -> None:
-    cluster.add(*(f"bus{n}" for n in range(60)))
+    cluster.add(*(f"bus{n}" for n in range(60)), "bus-60")  # no topic may have this name
     cluster.look()
     assert cluster.discoveries == 1
+    assert "bus-60" not in cluster.listed
     assert cluster.listed["bus7"] == {"id": "bus7", "type": "vehicle", "capacity": {"cpu": "4"}}
     message = cluster.newest
     assert message.startswith("Nodes of c-its: 60 came\n\nWhy: c-its said so.\n")
@@ -134,6 +140,9 @@ def test_what_changes_within_a_minute_shares_a_commit(cluster: Cluster, bare: Pa
     for n in range(3):
         cluster.add("bus0", "bus1", cordoned=True, other=f"{n}")
         cluster.look()
+    cluster.is_known = False  # it cannot be reached
+    cluster.nodes.clear()
+    cluster.look()
     assert cluster.discoveries == 2
     assert_sound(bare)
 
@@ -178,12 +187,25 @@ def test_a_cordon_moves_what_was_placed(cluster: Cluster, bare: Path) -> None:
     assert_sound(bare)
 
 
-def test_what_is_not_known_changes_nothing(cluster: Cluster) -> None:
+def test_a_node_moves_to_another_cluster_when_it_has_left_the_first(
+    cluster: Cluster, bare: Path, person: Person, clock: Clock
+) -> None:
+    person.change({CLUSTERS: f"{FROM_CLUSTER}  - {{name: other, nodes: from-cluster}}\n"})
+    cluster.generator.fetch_now()
     cluster.add("bus0")
+    cluster.of_other |= cluster.nodes  # both are new, but only one can be the node
     cluster.look()
-    cluster.is_known = False
+    assert git(bare, "grep", "-l", "bus0", "main", "--", "inventory/discovered").split() == [
+        f"main:{FILE}"
+    ]
+    cluster.nodes.clear()
     cluster.look()
-    assert cluster.discoveries == 1
+    clock.pass_(600)
+    cluster.look()
+    assert cluster.listed == {}
+    cluster.wait(node_discovery._PAUSE_S)
+    assert cluster.state.config.nodes["bus0"].cluster == "other"
+    assert_sound(bare)
 
 
 def test_people_cannot_edit_what_a_cluster_says(
@@ -282,8 +304,8 @@ def test_a_node_of_a_pattern_becomes_the_one_of_the_cluster(
     cluster.generator.fetch_now()
     cluster.book("bus0")
     assert cluster.state.config.nodes["bus0"].type == "bus"
-    cluster.add("bus0", role="tram")
+    cluster.add("bus0", "bus1", role="tram")
     cluster.look()
-    assert cluster.state.config.nodes["bus0"].type == "tram"
+    assert {cluster.state.config.nodes[id].type for id in ("bus0", "bus1")} == {"tram"}
     assert "~ " in cluster.newest.partition("Desired state:")[2]
     assert_sound(bare, verify_last=3)

@@ -11,7 +11,7 @@ import click
 
 from demandops.base.quoting import lines, one_line
 from demandops.cli.formats import output_formats, print_json
-from demandops.cli.output import busy, console, errors
+from demandops.cli.output import busy, errors, say
 from demandops.cli.queries.commits import entry_lines, release_lines
 from demandops.decide.state import FileChange
 from demandops.detect import rule_file
@@ -180,13 +180,12 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
             errors.print(f"error: {fault}")
         for warning in checked.warnings:
             errors.print(f"warning: {warning}")
-        out = console()
         if not checked.faults:
-            out.print(f"{directory}: all files are valid and every release renders")
+            say(f"{directory}: all files are valid and every release renders")
             for line in chart_lines(checked.charts):
-                out.print(line, soft_wrap=True)
+                say(line)
         for line in _lines(checked):
-            out.print(line, soft_wrap=True)
+            say(line)
     if checked.faults:
         raise click.exceptions.Exit(1)
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,8 @@ from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.naming import PATTERN_WORDS
 from demandops.base.quoting import quoted
 from demandops.base.settings import data_folder
-from demandops.cli.formats import Command, output_option, show
-from demandops.cli.output import busy
+from demandops.cli.formats import output_option, show
+from demandops.cli.output import busy, read_by
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.decide.state import State, try_configuration
 from demandops.model.config.base_model import document, matches
@@ -33,16 +32,14 @@ from demandops.repo.merge_check import edited_checkout
 from demandops.templating import charts
 from demandops.templating.evaluator import EVALUATE
 
-
-def _directory(what: str) -> Callable[[Command], Command]:
-    return click.option(
-        "--directory",
-        "-C",
-        type=click.Path(path_type=Path, exists=True, file_okay=False),
-        default=Path(),
-        metavar="DIR",
-        help=f"{what} Default: this folder.",
-    )
+_directory = click.option(
+    "--directory",
+    "-C",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    default=Path(),
+    metavar="DIR",
+    help="Where to write: a checked-out repository. Default: this folder.",
+)
 
 
 @click.group()
@@ -55,7 +52,7 @@ def new() -> None:
 
     \b
     Examples:
-      demandops new application tracking
+      demandops new image cam --repository ghcr.io/me/cam --state-repo git@host:f
     """
 
 
@@ -108,7 +105,7 @@ _URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A
     metavar="URL",
     help="The state repo to which the image is proposed.",
 )
-@_directory("The repository of the ROS package.")
+@_directory
 @output_option
 def image(name: str, repository: str, state_repo: str, directory: Path, output: str) -> None:
     """Write a container file and pipelines for a ROS package of your own.
@@ -183,46 +180,6 @@ def _image(text: str) -> Image:
     return Image(repository=image.name, tag=image.tag or None, digest=image.digest or None)
 
 
-# Maps an option to the question that asks for its values, and what reads a value.
-_QUESTIONS: Mapping[str, tuple[str, Callable[[str], object]]] = {
-    "--input": (
-        "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; separate several by spaces",
-        _input,
-    ),
-    "--service": (
-        "Services, as name=package/file, such as detector=my_package/detector; separate "
-        "several by spaces",
-        _service,
-    ),
-    "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image),
-}
-
-
-def _read(option: str, word: str) -> Any:  # noqa: ANN401
-    try:
-        return _QUESTIONS[option][1](word)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint=option) from None
-
-
-def _asked(option: str) -> tuple[str, ...]:
-    # until the answer has only words that are valid
-    def valid(answer: str) -> tuple[str, ...]:
-        if not (words := tuple(answer.split())):
-            raise click.UsageError(
-                "an answer is needed; Ctrl-C ends the command, and nothing is written"
-            )
-        if option == "--image" and len(words) > 1:
-            raise click.UsageError(f"'{answer}' has {len(words)} words; give 1")
-        for word in words:
-            _read(option, word)
-        return words
-
-    words: tuple[str, ...]
-    words = click.prompt(_QUESTIONS[option][0], default="", show_default=False, value_proc=valid)
-    return words
-
-
 @new.command()
 @click.argument("name")
 @click.option(
@@ -232,6 +189,8 @@ def _asked(option: str) -> tuple[str, ...]:
     "--input",
     "inputs",
     multiple=True,
+    required=True,
+    callback=read_by(_input),
     metavar="ROLE=TYPE",
     help="An input and its message type: camera=sensor_msgs/msg/Image. May be repeated.",
 )
@@ -239,59 +198,56 @@ def _asked(option: str) -> tuple[str, ...]:
     "--service",
     "services",
     multiple=True,
+    required=True,
+    callback=read_by(_service),
     metavar="NAME=PACKAGE/FILE",
     help="A service and the executable or launch file of its node: detector=my_package/detector. "
     "May be repeated. Each further service reads the outputs of the service before it.",
 )
-@click.option("--image", default="", metavar="IMAGE", help="The image, with a tag or digest.")
+@click.option(
+    "--image",
+    required=True,
+    callback=read_by(_image),
+    metavar="IMAGE",
+    help="The image, with a tag or digest: ghcr.io/me/tracking:1.0.",
+)
 @click.option(
     "--node",
     default="",
     metavar="ID",
     help="The node of the example demand. Default: an edge server if there is one.",
 )
-@_directory("The checked-out state repo.")
+@_directory
 @output_option
 def application(  # noqa: PLR0913 - as many as options
     name: str,
     *,
     description: str,
-    inputs: tuple[str, ...],
-    services: tuple[str, ...],
-    image: str,
+    inputs: tuple[tuple[str, str], ...],
+    services: tuple[_Service, ...],
+    image: Image,
     node: str,
     directory: Path,
     output: str,
 ) -> None:
     """Write a new application: definition, values, chart, registry, README, a node and a demand.
 
-    Its nodes take new inputs, parameters and outputs while they run, as ROS parameters. On a
-    terminal, the command asks for --input, --service and --image if they are missing.
+    Its nodes take new inputs, parameters and outputs while they run, as ROS parameters.
 
     \b
     Examples:
-      demandops new application tracking
-      demandops new application tracking --input camera=sensor_msgs/msg/Image
+      demandops new application x --input a=b/msg/C --service s=p/f --image r/i:1
     """
     with busy("reading the state repo"):
         with edited_checkout.opened(directory) as (_, tree):
             existing = trees.texts(tree, CONFIG_ROOTS)
         config = load(existing)
-    # before the questions, so that nobody answers them in vain
     if not _APPLICATION_NAME.fullmatch(name):
         words = PATTERN_WORDS[_APPLICATION_NAME.pattern]
         raise InvalidInput.at("NAME", f"{quoted(name)} cannot be used here; write {words}")
     if name in (*config.appdefs, *config.charts, *config.images, _SYNC):
         raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")
-    given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
-    missing = [option for option, values in given.items() if not values]
-    if missing and not sys.stdin.isatty():
-        options = ", ".join(f"'{option}'" for option in missing)
-        raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
-    values = {option: given[option] or _asked(option) for option in given}
-    planned: list[_Service] = [_read("--service", word) for word in values["--service"]]
-    types = dict(_read("--input", word) for word in values["--input"])
-    pulled = _read("--image", values["--image"][0])
+    types = dict(inputs)
     # a demand can name only nodes in an access domain
     known = (*config.domain_of, *config.example_nodes())
     nodes = sorted(known, key=lambda id: (config.nodes[id].type != "edge", id))
@@ -301,8 +257,8 @@ def application(  # noqa: PLR0913 - as many as options
             "first, in inventory/nodes.yaml"
         )
     node = node or nodes[0]
-    description = description or f"Runs {', '.join(service.name for service in planned)}"
-    files = _application_files(name, description, types, planned, pulled, config)
+    description = description or f"Runs {', '.join(service.name for service in services)}"
+    files = _application_files(name, description, types, services, image, config)
     path = f"appdefs/{name}/demand.yaml"
     files[path], is_allowed = _example_demand(path, name, types, node, config)
     if strange := [path for path in files if ".." in path.split("/") or "//" in path]:
@@ -346,7 +302,7 @@ def _application_files(
     name: str,
     description: str,
     types: Mapping[str, str],
-    services: list[_Service],
+    services: Sequence[_Service],
     image: Image,
     config: Config,
 ) -> dict[str, str]:

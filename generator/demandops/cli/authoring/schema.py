@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from demandops.base import strict_yaml
 from demandops.base.settings import API_VERSION, data_folder
-from demandops.cli.output import console
+from demandops.cli.output import say
 from demandops.cli.target import ContextsFile
 from demandops.cluster.clusters_file import AccessFile
 from demandops.detect.rule_file import RuleFile
@@ -109,10 +109,10 @@ def schema(name: str | None, folder: Path | None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         for kind in SCHEMAS:
             folder.joinpath(f"{kind}.json").write_text(text(kind))
-        console().print(f"{len(SCHEMAS)} schemas in {folder}")
+        say(f"{len(SCHEMAS)} schemas in {folder}")
     elif name is None:
         for kind, (_, file) in SCHEMAS.items():
-            console().print(f"{kind:20} {file}")
+            say(f"{kind:20} {file}")
     else:
         click.echo(text(name), nl=False)
 

@@ -27,7 +27,7 @@ from demandops.cli.changes import ledger_change
 from demandops.cli.changes.ledger_change import started_generator
 from demandops.cli.changes.person_change import confirm, consequence
 from demandops.cli.formats import faults_of, output_option, print_json
-from demandops.cli.output import console, done, errors, progress
+from demandops.cli.output import busy, done, errors, say
 from demandops.cli.queries.commits import release_lines
 from demandops.cli.target import (
     NO_STATE_REPO,
@@ -278,7 +278,7 @@ def _book(
 
     has_started = False
     try:
-        with started_generator(state_repo, signing_key) as generator, progress("booking") as report:
+        with started_generator(state_repo, signing_key) as generator, busy("booking") as report:
             has_started = True
             for document in documents:
                 submit(generator, document)
@@ -323,7 +323,7 @@ def _book(
 def _decided(
     documents: list[Document], state_repo: str
 ) -> Iterator[tuple[int, Document, Decision | InvalidInput]]:
-    with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
+    with reader.opened(state_repo) as repo, busy("reading the ledger") as report:
         refuse_other_render_version(repo.objects, repo.repository.tip())
         state = repo.snapshot(progress=report).state
         # each request is decided as if the requests before it were booked
@@ -362,14 +362,14 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
             continue
         outcome = "proposed" if decision.approval else decision.outcome
         if output == "text":
-            console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
+            say(f"Request {index}: '{decision.request.id}' would be {outcome}")
             for rule in decision.approval:
-                console().print(f"  needs approval: {rule} requires it")
+                say(f"  needs approval: {rule} requires it")
             lines = [*release_lines(decision.releases)]
             for path, text in sorted(decision.files.items()):
                 lines.append(f"{'remove' if text is None else 'write '} {path}")
             for line in lines:
-                console().print(f"  {line}", soft_wrap=True)
+                say(f"  {line}")
         more: Json = {
             "warnings": decision.warnings,
             "not_held": decision.changes.not_held,
@@ -389,7 +389,6 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
     if output == "json":
         print_json(rows)
         return
-    out = console()
     for row, document in zip(rows, documents, strict=True):
         title = f"{document.file}: request {row['index']} '{one_line(row['request'])}'"
         if not dry_run and _is_unanswered(row):
@@ -409,9 +408,9 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
                 told += f", for {duration_text(row['lease'])} unless renewed"
             if proposal := row.get("proposal"):
                 told = f"awaiting approval {proposal['branch']} {proposal['link']}".rstrip()
-            out.print(f"{title} {told}", soft_wrap=True)
+            say(f"{title} {told}")
         for told in (*row["placed"], *(() if dry_run else row["effects"])):
-            out.print(f"  {told}", soft_wrap=True)
+            say(f"  {told}")
         warnings = [*row["warnings"]]
         lease = document.goal.get("lease") if isinstance(document.goal, dict) else None
         if isinstance(lease, int) and not isinstance(lease, bool):

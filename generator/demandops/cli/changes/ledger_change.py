@@ -24,7 +24,7 @@ from demandops.cli.changes.person_change import (
     warned_if_unnamed,
 )
 from demandops.cli.formats import show
-from demandops.cli.output import busy, done, errors, fitted, progress, terminal_width
+from demandops.cli.output import busy, done, errors, fitted, terminal_width
 from demandops.cli.queries.commits import resolved
 from demandops.cli.target import name_options, names_of, options_for
 from demandops.decide.decision import decide
@@ -56,7 +56,7 @@ def await_answer(future: Future[Any]) -> None:
 
 @contextmanager
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
-    with progress("reading the ledger") as report:
+    with busy("reading the ledger") as report:
         generator = Generator(
             state_repo,
             requester_limit=None,  # the command is its only client
@@ -88,7 +88,7 @@ def _book(
     what followed, or would follow.
     """
     with reader.opened(options.state_repo, only_read=options.dry_run) as repo:
-        with progress("reading the ledger") as report:
+        with busy("reading the ledger") as report:
             state = repo.snapshot(progress=report).state
         goal = goal_of(repo, state)
         request = restoration(repo.objects, goal) if isinstance(goal, Rollback) else goal

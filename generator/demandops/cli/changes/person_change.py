@@ -25,7 +25,7 @@ from demandops.base.quoting import harmless, one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import formats, target
-from demandops.cli.output import done, errors, fitted, progress, terminal_width
+from demandops.cli.output import busy, done, errors, fitted, terminal_width
 from demandops.cli.queries.commits import differences, entry_lines, release_lines
 from demandops.decide.planning.overrides import suspended_claims
 from demandops.decide.planning.planner import ReleaseKey
@@ -209,7 +209,7 @@ def commit(
 
     ``more`` returns further JSON and further lines about the state before and after.
     """
-    with progress("reading the ledger") as report:
+    with busy("reading the ledger") as report:
         before = repo.snapshot(progress=report)
         after = person_commit.state_after(repo.repository, before, files)
 

@@ -16,7 +16,7 @@ import click
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.runtime import REAL
 from demandops.cli.formats import Table, list_table, output_formats, output_option, show
-from demandops.cli.output import busy, errors, painted, progress, read_by, warn_of_not_rendered
+from demandops.cli.output import busy, errors, painted, read_by, warn_of_not_rendered
 from demandops.cli.queries.commits import in_effect, log_table
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
@@ -150,7 +150,7 @@ def status(
 def read_status(
     repo: Reader, clusters: Mapping[str, ClusterAccess], patience_s: int = _PATIENCE_S
 ) -> Source:
-    with progress("reading the ledger") as report:
+    with busy("reading the ledger") as report:
         snapshot = repo.snapshot(progress=report)
     return ask_clusters(Source.read(repo, snapshot), repo, clusters, patience_s)
 
@@ -374,7 +374,7 @@ def web(state_repo: str, listen: str, access_file: Path | None, interval: float)
     from demandops.web.server import WebServer  # noqa: PLC0415
 
     clusters = clusters_file.read(access_file).clusters if access_file else {}
-    with progress("reading the ledger") as report:
+    with busy("reading the ledger") as report:
         follower = Follower(Reader.of(state_repo), clusters, interval, progress=report)
     with closing(WebServer(listen, "--listen", follower)) as server:
         click.echo(server.url)

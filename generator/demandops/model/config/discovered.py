@@ -40,6 +40,7 @@ from demandops.model.config.inventory import (
     PropertyName,
     PropertyValue,
     Resources,
+    comparable_kind,
     kind_of,
 )
 
@@ -48,7 +49,7 @@ _NOTE = """\
 # Written by the generator: the nodes as the cluster has them. Edits are put back. To change a node,
 # change it in the cluster, or list it in inventory/nodes.yaml, which replaces its whole entry here.
 """
-_IN_ENTRY = re.compile(r"(nodes\[\d+\])\.(?!id$)(.*)")
+_OF_NODE = re.compile(r"(nodes\[\d+\])(?:\.(.*))?")
 
 
 # The value of the label `node_id`
@@ -99,28 +100,41 @@ def text_of(nodes: Iterable[DiscoveredNode]) -> str:
 
 
 def read_nodes(
-    reader: ConfigReader, clusters: Mapping[str, Cluster], listed: Mapping[str, Node]
+    reader: ConfigReader,
+    clusters: Mapping[str, Cluster],
+    listed: Mapping[str, Node],
+    required: Iterable[Mapping[str, object]],
 ) -> dict[str, Node]:
-    """Return the discovered nodes that nobody lists; collect the faults of entries and files."""
+    """Return the discovered nodes that nobody lists; collect the faults of entries and files.
+
+    ``required`` has the properties that definitions require of nodes.
+    """
     nodes, places = dict[str, Node](), reader.places[NODES_FILE]
+    examples = [pattern.example for pattern in reader.patterns[NODES_FILE]]
     for name, cluster in sorted(clusters.items()):
         if cluster.nodes == "listed":  # a file that is left over is removed by the generator
             continue
         pattern, path = _pattern(reader, cluster), path_of(name)
         try:
-            _ = pattern.example  # so that the faults of the entry are those of its file
-            for number, node in enumerate(read(reader.files.get(path), path)):
-                if node.id in places:  # a listed node is meant to differ, as a whole
-                    continue
-                own = node.model_dump(by_alias=True, exclude_defaults=True, exclude={"gone_since"})
-                own["drained"] = node.drained or node.gone_since is not None
-                nodes[node.id] = pattern.entry(node.id, own)
-                places[node.id] = (path, f"nodes[{number}]")
+            examples.append(pattern.example)  # the faults of the entry are those of its file
+            known = read(reader.files.get(path), path)
         except InvalidInput as error:
             reader.faults += error.faults
             reader.incomplete.add(NODES_FILE)
-    examples = (pattern.example for pattern in reader.patterns[NODES_FILE])
-    return dict(_of_one_kind(nodes, [*listed.values(), *examples]))
+            continue
+        for number, node in enumerate(known):
+            if node.id in places:  # a listed node is meant to differ, as a whole
+                continue
+            places[node.id] = (path, f"nodes[{number}]")
+            own = node.model_dump(by_alias=True, exclude_defaults=True, exclude={"gone_since"})
+            own["drained"] = node.drained or node.gone_since is not None
+            try:
+                here = replace(pattern, file=path, place=("nodes", number))
+                nodes[node.id] = here.entry(node.id, own)
+            except InvalidInput as error:
+                reader.faults += error.faults
+    by_people = [*(node.properties for node in (*listed.values(), *examples)), *required]
+    return dict(_of_one_kind(nodes, by_people))
 
 
 def _pattern(reader: ConfigReader, cluster: Cluster) -> EntryPattern[Node]:
@@ -131,14 +145,17 @@ def _pattern(reader: ConfigReader, cluster: Cluster) -> EntryPattern[Node]:
     return EntryPattern("{n}", "id", Node, data, file, (f"{place}.discovery.entry",))
 
 
-def _of_one_kind(nodes: Mapping[str, Node], listed: Iterable[Node]) -> Iterator[tuple[str, Node]]:
+def _of_one_kind(
+    nodes: Mapping[str, Node], by_people: Iterable[Mapping[str, object]]
+) -> Iterator[tuple[str, Node]]:
     # A property has values of one type. A label with an odd value must not make people's files
     # invalid, so they decide about the type, else most nodes do; other values do not count.
     kinds = defaultdict[str, Counter[Kind | None]](Counter)
-    for weight, group in ((1, nodes.values()), (len(nodes) + 1, listed)):
-        for node in group:
-            for name, value in node.properties.items():
-                kinds[name][kind_of(value)] += weight
+    own = (node.properties for node in nodes.values())
+    for weight, group in ((1, own), (len(nodes) + 1, by_people)):
+        for properties in group:
+            for name, value in properties.items():
+                kinds[name][comparable_kind(value)] += weight
     common = {name: counts.most_common(1)[0][0] for name, counts in kinds.items()}
     for id, node in nodes.items():
         fitting = {n: v for n, v in node.properties.items() if kind_of(v) == common[n]}
@@ -146,12 +163,26 @@ def _of_one_kind(nodes: Mapping[str, Node], listed: Iterable[Node]) -> Iterator[
         yield id, node.model_copy(update={"properties": fitting}) if is_odd else node
 
 
-def in_entry(fault: Fault, reader: ConfigReader) -> Fault:
-    """Return a fault of a discovered node at the place where people can mend it."""
-    match = _IN_ENTRY.fullmatch(fault.field) if is_discovered(fault.file) else None
-    # the faults of an edited file, from which no node was read, are its own
-    if match is None or (fault.file, match[1]) not in reader.places[NODES_FILE].values():
-        return fault
-    name = fault.file.rpartition("/")[2].removesuffix(".yaml")
-    file, place = reader.places[CLUSTERS_FILE][name]
-    return replace(fault, file=file, field=f"{place}.discovery.entry.{match[2]}")
+class InvalidConfig(InvalidInput):
+    """The faults of a configuration; ``of_nodes`` has one of each discovered node with faults."""
+
+    def __init__(self, reader: ConfigReader) -> None:
+        ids, faults = dict[tuple[str, str], str](), dict[object, Fault]()
+        for id, at in reader.places[NODES_FILE].items():
+            ids.setdefault(at, id)  # a machine's own node is before those of its further domains
+        self.of_nodes: dict[str, object] = {}
+        for fault in reader.faults:
+            match = _OF_NODE.fullmatch(fault.field) if is_discovered(fault.file) else None
+            # the faults of an edited file, from which no node was read, are its own
+            owner = ids.get((fault.file, match[1])) if match else None
+            if match is None or owner is None:
+                faults[fault] = fault
+                continue
+            if match[2] != "id":  # people can mend it in the entry, and there it is one for all
+                name = fault.file.rpartition("/")[2].removesuffix(".yaml")
+                file, place = reader.places[CLUSTERS_FILE][name]
+                field = f"{place}.discovery.entry" + (f".{match[2]}" if match[2] else "")
+                fault = replace(fault, file=file, field=field)  # noqa: PLW2901
+            self.of_nodes.setdefault(owner, fault)
+            faults.setdefault((fault.file, fault.field), fault)
+        super().__init__(faults.values())

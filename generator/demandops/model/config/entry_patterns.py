@@ -348,11 +348,18 @@ class UnlistedNodes:
         node, problem = self.patterns.find(id)
         if node is None:
             return None, None, problem
+        if problem := self.of_several_domains(id):
+            return node, None, problem
+        name = next((name for _, name in self._globs.matching(id)), None)
+        return node, self._domains[name] if name is not None else None, ""
+
+    def of_several_domains(self, id: str) -> str:
+        """Return which access domains match an id, if these are several; then it is in none."""
         by_name = {name: glob for glob, name in self._globs.matching(id)}
-        if len(by_name) > 1:
-            named = " and ".join(f"'{name}' by {quoted(by_name[name])}" for name in sorted(by_name))
-            return node, None, f"is in the access domains {named}; narrow these patterns"
-        return node, self._domains[min(by_name)] if by_name else None, ""
+        if len(by_name) < 2:
+            return ""
+        named = " and ".join(f"'{name}' by {quoted(by_name[name])}" for name in sorted(by_name))
+        return f"is in the access domains {named}; narrow these patterns"
 
 
 NO_BROKER_PATTERNS = EntryPatterns[Any]("broker")

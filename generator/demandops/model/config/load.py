@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from itertools import chain
 from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-from demandops.base.errors import InvalidInput
 from demandops.base.placeholders import filled, values_in
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION, RENDER_VERSION
@@ -67,7 +67,12 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         configs.CLUSTERS_FILE, inventory.ClustersFile, "clusters", inventory.Cluster, "name"
     )
     nodes = reader.read_items(configs.NODES_FILE, inventory.NodesFile, "nodes", Node, "id")
-    nodes |= discovered.read_nodes(reader, clusters, nodes)
+    appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
+    definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
+    of_appdefs = chain.from_iterable(appdef.services.values() for appdef in appdefs.values())
+    deployed = (*of_appdefs, *definitions.values())
+    required = [each.place.properties for each in deployed if each.place]
+    nodes |= discovered.read_nodes(reader, clusters, nodes, required)
     domains = reader.read_items(
         configs.DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name"
     )
@@ -85,8 +90,6 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
 
     node_patterns = EntryPatterns("node", reader.patterns[configs.NODES_FILE], "cluster", clusters)
     unlisted = UnlistedNodes(node_patterns, domains, completed)
-    appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
-    definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
     clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of[configs.CLIENTS_FILE]:
         part = reader.read_file(file, registry.ClientsFile)
@@ -189,8 +192,7 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     )
     cross_check(config, reader)
     if reader.faults:
-        faults = (discovered.in_entry(each, reader) for each in reader.faults)
-        raise InvalidInput(dict.fromkeys(faults))
+        raise discovered.InvalidConfig(reader)
     return config
 
 
