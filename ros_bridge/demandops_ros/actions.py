@@ -12,7 +12,6 @@ import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from builtin_interfaces.msg import Duration
-from demandops.base import errors
 from demandops.base.errors import DemandOpsError, InvalidInput, Withdrawn
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
@@ -31,16 +30,6 @@ from demandops_ros.ros_process import ExecutorThread
 # ---- an adapter for each action ----
 #
 # An adapter turns goals into plain data, and stages and outcomes into messages.
-
-# The first kind that fits counts.
-_CODES: tuple[tuple[type[BaseException], str], ...] = (
-    (Withdrawn, "withdrawn"),
-    (errors.TurnedDown, "turned-down"),
-    (errors.ShuttingDown, "shutting-down"),
-    (DemandOpsError, "state-repo"),
-    (BaseException, "fault"),
-)
-
 
 # The request id of all claims by DeploymentRequests if the node ignores the ids of goals. A claim's
 # file and its commit say so by this text.
@@ -124,11 +113,7 @@ def _not_held(receipt: Receipt) -> list[str]:
 def _code(outcome: Receipt | BaseException) -> str:
     if isinstance(outcome, Receipt):
         return "ok"
-    if isinstance(outcome, InvalidInput):
-        return outcome.faults[0].code
-    if isinstance(outcome, errors.NotReached):
-        return f"not-{outcome.level}"
-    return next(code for kind, code in _CODES if isinstance(outcome, kind))
+    return outcome.code if isinstance(outcome, DemandOpsError) else "fault"
 
 
 # ---- endpoints: a client that sends goals, a server, and a search for other servers ----

@@ -10,7 +10,7 @@ import click
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_secret
 from demandops.cli.output import busy, errors
-from demandops.cli.target import signing_option
+from demandops.cli.target import clusters_option, signing_option
 from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.leadership import Leadership
 from demandops.cluster.nodes import ClusterNodes
@@ -37,15 +37,7 @@ _TASK_S = 5.0
     help="The state repo: a folder with a bare repository, or a URL that git clones; also the ROS "
     "parameter state_repo [env: DEMANDOPS_STATE_REPO].",
 )
-@click.option(
-    "--clusters",
-    "access_file",
-    envvar="DEMANDOPS_CLUSTERS",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="How to reach the clusters, to notify them of a push and to watch rollouts; see "
-    "docs/status.md [env: DEMANDOPS_CLUSTERS].",
-)
+@clusters_option
 @click.option(
     "--fetch-interval",
     metavar="DURATION",

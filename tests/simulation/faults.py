@@ -116,7 +116,7 @@ def undoing_deletions(follow: Wrong, batch: Any, followed: Any, now: Any) -> Non
     if files:
         author = batch._objects[followed.snapshot.commit].author
         state = replace(batch.head.state, ledger=ledger)
-        batch.commit_files(files, state, "Undo\n\nRender-Version: 3\n", author, now)
+        batch.commit_files(files, state, "Undo\n\nRender-Version: 3\n", now, author)
 
 
 def booking_again(
@@ -126,7 +126,7 @@ def booking_again(
         batch = CommitBatch(made._repository, snapshot)
         text = f"Again\n\nOperation-Id: {ticket.operation}\nRender-Version: 3\n"
         author = batch._objects[snapshot.commit].author
-        batch.commit_files(decision.files, decision.state, text, author, made._runtime.now())
+        batch.commit_files(decision.files, decision.state, text, made._runtime.now(), author)
         batch.publish()
     return right(made, ticket, decision, snapshot, *more)
 

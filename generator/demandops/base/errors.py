@@ -61,7 +61,10 @@ class DemandOpsError(Exception):
     """Base of every error that this program raises on purpose.
 
     The text of an error is one line. The text of :class:`InvalidInput` has one line for each fault.
+    ``code`` is a stable word for the clients of actions.
     """
+
+    code = "state-repo"
 
     def __str__(self) -> str:
         return one_line(super().__str__())
@@ -85,6 +88,7 @@ class InvalidInput(DemandOpsError):
             if count > MOST_FAULTS:
                 kept.append(Fault("more", "", f"has {count - MOST_FAULTS} more faults", file))
         self.faults = tuple(kept)
+        self.code = kept[0].code if kept else ""
         super().__init__(self.faults)
 
     def __str__(self) -> str:
@@ -135,9 +139,13 @@ class BeforeTheFirst(StateRepoError):
 class Withdrawn(DemandOpsError):
     """Raised when a demand is canceled, released or replaced before its commit."""
 
+    code = "withdrawn"
+
 
 class TurnedDown(DemandOpsError):
     """Raised when a person did not approve a demand that needed approval."""
+
+    code = "turned-down"
 
 
 class NotReached(DemandOpsError):
@@ -145,7 +153,7 @@ class NotReached(DemandOpsError):
 
     def __init__(self, level: str, message: str) -> None:
         super().__init__(message)
-        self.level = level
+        self.code = f"not-{level}"
 
 
 class ShuttingDown(DemandOpsError):
@@ -154,6 +162,8 @@ class ShuttingDown(DemandOpsError):
     A demand that arrived before the stop stays in the journal, and the next start resumes it. A
     demand that arrives during the stop is not accepted. The message says which of both it is.
     """
+
+    code = "shutting-down"
 
 
 class Unsound(DemandOpsError):

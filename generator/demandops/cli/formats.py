@@ -45,16 +45,13 @@ class _Format(click.Choice[str]):
 
 def output_formats(*formats: str) -> Callable[[Command], Command]:
     # with ``--output json``, a command that raises DemandOpsError also prints the faults as JSON
-    description = "The output format."
-    if "markdown" in formats:
-        description = "The output format; markdown is for a comment on a pull request."
     option = click.option(
         "-o",
         "--output",
         type=_Format(formats),
         default="text",
         show_default=True,
-        help=description,
+        help="The output format.",
     )
 
     def add(command: Command) -> Command:
@@ -176,13 +173,11 @@ _GAP = "  "
 # If the terminal has no room for this width, columns are left out.
 _COMFORT = 12
 
-Cell = str | Sequence[str]  # several texts are joined by commas
-
 
 @dataclass(frozen=True, slots=True)
 class Table:
     columns: Sequence[Column]
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Sequence[Sequence[str]]]  # the texts of each cell, which commas join
     title: str = ""
     empty: str = "(nothing)"
     # Maps a cell's text to its color, for terminals that show colors.
@@ -198,10 +193,7 @@ class Table:
         if not self.rows:
             return [*title, self.empty]
         heads = [column.title.upper() for column in self.columns]
-        rows = [
-            [one_line(cell if isinstance(cell, str) else ", ".join(cell)) for cell in row]
-            for row in self.rows
-        ]
+        rows = [[one_line(", ".join(cell)) for cell in row] for row in self.rows]
         texts = [[head, *cells] for head, cells in zip(heads, zip(*rows, strict=True), strict=True)]
         natural = [max(map(cell_len, column)) for column in texts]
         least = [

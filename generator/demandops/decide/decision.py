@@ -182,8 +182,7 @@ def decide(
             checkpoint=checkpoint,
         )
         checkpoint()
-        claims = [(change.before, change.after) for change in changes.claims]
-        required_by, approved_by = permission.approval(request, claims, config)
+        required_by, approved_by = permission.approval(request, changes.claims, config)
         # a demand may list one thing twice, and several releases may have one reason
         notes = dict.fromkeys(notes_on(request, state, after, changes, rendered))
         for difference in booked.differing:
@@ -365,9 +364,10 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
         )
     if isinstance(request, Restoration):
         # claims of before the upgrade may carry a route twice
-        united, _ = carriers.with_one_carrier(ledger_of(request.claims))
-        request = replace(request, claims=tuple(united))
-        request = relocation.with_restored_moves(request, state)
+        then, _ = carriers.with_one_carrier(ledger_of(request.claims))
+        then = replace(then, ended=state.ledger.ended)
+        moved = relocation.following_overrides(replace(state, ledger=then))
+        request = replace(request, claims=tuple(moved.ledger))
         if faults := list(restoration_faults(request, state)):
             raise Refused(faults)
     checkpoint()
@@ -515,8 +515,7 @@ def may_demand(
             if matches(requester, rule.requesters)
             and permission.first_uncovered(rule, access) is None
         )
-        pairs = ((change.before, change.after) for change in changes.claims)
-        approval = permission.approval(demand, pairs, config)
+        approval = permission.approval(demand, changes.claims, config)
         answer = Answer(name, tuple(dict.fromkeys(faults)), tuple(rules), *approval)
         if not faults:
             break

@@ -317,6 +317,8 @@ def effect_on_pods(
     if was == now:  # only comments differ, which name overrides
         return ""
     live = {*new.service.live, *_ALWAYS_LIVE} if isinstance(new, ServiceRelease) else set()
+    if "restart" in now.get("reconfigure", ""):  # of the library, by a template or an override
+        live.discard("parameters")
     differing = {name for name in {**was, **now} if was.get(name, ABSENT) != now.get(name, ABSENT)}
     return "reconfigures" if differing <= live else "restarts"
 
@@ -325,28 +327,51 @@ def effect_on_pods(
 
 
 def rendered_files(
-    state: State, current: Mapping[str, str] = MappingProxyType({}), *, keeps_late: bool = False
+    state: State,
+    current: Mapping[str, str] = MappingProxyType({}),
+    *,
+    keeps_late: bool = False,
+    edited: Collection[str] = (),
 ) -> dict[str, str]:
     """Return all generated files except those of the ledger, by path.
 
     A ``hold`` override keeps files of ``current``. With ``keeps_late``, so does a release whose
     values take too long to compute.
+
+    Raises:
+        InvalidInput: with the faults of all releases. The file of each is the first of these that
+            exists: a file in ``edited`` with a claim that needs the release; the file that the
+            fault names; the file of the first claim that needs the release.
     """
     config, keys = state.config, all_keys(state)
-    files = gitops.base_files(config)
+    files, errors = gitops.base_files(config), dict[ReleaseKey, InvalidInput]()
     collisions.refuse_shared_names(state, keys)  # one would overwrite the file of the other
     for key in keys:
-        if (release := plan(state, key)) is None:
-            continue
-        path = gitops.path_of(release)
+        path = ""
         try:
-            files[path] = gitops.release_text(release, config, state.evaluate, current.get(path))
-        except OverLimit:
-            if not keeps_late:
-                raise
-            if path in current:
+            if release := plan(state, key):
+                path = path_of(release)
+                was = current.get(path)
+                files[path] = gitops.release_text(release, config, state.evaluate, was)
+        except InvalidInput as error:
+            if not (keeps_late and isinstance(error, OverLimit)):
+                errors[key] = error
+            elif path in current:
                 files[path] = current[path]
-    return files | gitops.kept_charts(files, current, state)
+    if not errors:
+        return files | gitops.kept_charts(files, current, state)
+    claims: dict[ReleaseKey, list[str]] = {}
+    for subject in sorted(state.ledger.claims, key=str):
+        paths = [claim_files.path_of(claim.key) for claim in state.ledger.claims_on(subject)]
+        for key in keys_of(state, subject):
+            claims.setdefault(key, []).extend(paths)
+    faults: dict[Fault, None] = {}
+    for key, failure in errors.items():
+        edited_claim = next((path for path in claims.get(key, ()) if path in edited), "")
+        first = next(iter(claims.get(key, ())), "")
+        for each in failure.faults:
+            faults[each.within(edited_claim or each.file or first)] = None
+    raise InvalidInput(faults)
 
 
 # ---- trial demands: a new configuration must render before real demands arrive ----
@@ -479,35 +504,6 @@ class MergePreview:
 
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
     return {key: each for key, each in planned(world, all_keys(world)).items() if each}
-
-
-def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()) -> list[Fault]:
-    """Return the faults because of which releases cannot be planned or rendered.
-
-    A fault's file is the first of these that exists: a file in ``edited`` with a claim that needs
-    the release; the file that the fault names; the file of the first claim that needs the release.
-    """
-    errors: list[tuple[ReleaseKey, InvalidInput]] = []
-    for key in all_keys(world):
-        try:
-            if release := plan(world, key):
-                gitops.render(release, world.config, evaluate)
-        except InvalidInput as error:
-            errors.append((key, error))
-    if not errors:
-        return []
-    files: dict[ReleaseKey, list[str]] = {}
-    for subject in sorted(world.ledger.claims, key=str):
-        paths = [claim_files.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
-        for key in keys_of(world, subject):
-            files.setdefault(key, []).extend(paths)
-    faults: list[Fault] = []
-    for key, failure in errors:
-        claims = files.get(key, [])
-        edited_claim = next((path for path in claims if path in edited), "")
-        first = next(iter(claims), "")
-        faults += [fault.within(edited_claim or fault.file or first) for fault in failure.faults]
-    return list(dict.fromkeys(faults))
 
 
 def described(

@@ -89,9 +89,8 @@ def _read_folder(folder: Path, prefix: str) -> dict[str, str]:
 # ---- the repository with its first commit ----
 
 _WHY = "Why: `demandops init` made it from the skeleton; README.md says what each folder holds."
-_FIRST_MESSAGE = commit_message.compose(
-    [["Create the state repo"], [_WHY]],
-    [("Operation", "init"), ("Render-Version", str(RENDER_VERSION))],
+_FIRST_MESSAGE = commit_message.of_generator(
+    [["Create the state repo"], [_WHY]], [("Operation", "init")]
 )
 
 

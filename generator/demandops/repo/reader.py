@@ -222,11 +222,7 @@ class Reader:
         return str(base or self._tip)
 
     def changed_roots(self, commit: str) -> tuple[str, ...]:
-        opened = trees.commit_of(self.objects, commit)
-        before = {entry.name: entry.id for entry in trees.parent_tree(opened) or ()}
-        after = {entry.name: entry.id for entry in opened.tree}
-        changed = {name for name in {*before, *after} if before.get(name) != after.get(name)}
-        return tuple(sorted(map(str, changed)))
+        return tuple(sorted({path.split("/")[0] for path in self.files_changed_by(commit)}))
 
     def files_changed_by(self, commit: str) -> list[str]:
         after = trees.commit_of(self.objects, commit)

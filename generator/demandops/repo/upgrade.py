@@ -94,7 +94,7 @@ def upgrade(
             who = commit_log.operator(repository.objects.path)
             author = commit_message.signature(who.name, who.email, now)
             text = _message(planned, keys)
-            commit = batch.commit_files(planned.files, state, text, author, now)
+            commit = batch.commit_files(planned.files, state, text, now, author)
             if batch.publish():
                 return replace(planned, commit=commit)
             REAL.sleep(_PAUSE_S * attempt * REAL.uniform(0.5, 1.0))
@@ -219,7 +219,6 @@ def _message(upgrade: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         ("Gitops", new.gitops),
         *commit_message.override_trailers((), keys),
         *commit_message.demand_trailers(keys),
-        ("Render-Version", str(new.render_version)),
     ]
     files = [f"  {count} in {folder}" for folder, count in sorted(counts.items())]
     paragraphs = [
@@ -227,4 +226,4 @@ def _message(upgrade: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         [f"Why: `demandops upgrade` renders everything {why}."],
         ["Files written or removed:", *files],
     ]
-    return commit_message.compose(paragraphs, trailers)
+    return commit_message.of_generator(paragraphs, trailers)

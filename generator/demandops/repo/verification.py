@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import pygit2
@@ -16,14 +16,13 @@ from demandops.base.settings import (
     REPORTS_ROOT,
 )
 from demandops.decide.planning.planner import ReleaseKey, affected_keys, all_keys, plan
-from demandops.decide.state import rendered_files
 from demandops.model.config import discovered
 from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
-from demandops.model.ledger.ledger import ClaimChange, World
+from demandops.model.ledger.ledger import ClaimChange
 from demandops.model.release import Release
 from demandops.render import gitops
 from demandops.render.gitops import path_of
@@ -175,7 +174,8 @@ class _Proof:
         self._held: dict[ReleaseKey, Release] = {}
         base_files = gitops.base_files(self.state.config)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
-        self._committed = _generated_files(commit.tree)
+        committed = trees.entries(commit.tree, GENERATED_ROOTS)
+        self._committed = {path: child.id for path, child in committed}
         self._render(all_keys(self.state))
 
     def advanced(self, snapshot: Snapshot, commit: Commit) -> bool:
@@ -215,7 +215,7 @@ class _Proof:
     def differing(self) -> tuple[str, ...]:
         wanted = self._undemanded | dict(self._planned.values())
         before = trees.parent_tree(self._commit)
-        if before is not None and _holds(self.state):
+        if before is not None and any(override.hold for override in self.state.overrides):
             charts = {
                 path: trees.text_of(blob)
                 for path, blob in trees.blobs(before, GENERATED_ROOTS)
@@ -223,7 +223,11 @@ class _Proof:
             }
             kept = gitops.kept_charts({}, charts, self.state)
             wanted |= {path: _blob(text) for path, text in kept.items()}
-        return _differing(wanted, self._committed)
+        return tuple(
+            path
+            for path in sorted({*wanted, *self._committed})
+            if wanted.get(path) != self._committed.get(path) and not trees.is_readme(path)
+        )
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
@@ -255,18 +259,11 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         try:
             verdict = replace(verdict, touched=tuple(sorted(disallowed_files(repo, commit, entry))))
             if whole or place == len(commits):
-                state = _loaded(repo, commit, entry).state
-                parent = trees.parent_tree(commit) if _holds(state) else None
-                held = trees.texts(parent, GENERATED_ROOTS) if parent is not None else {}
-                wanted = {path: _blob(t) for path, t in rendered_files(state, held).items()}
-                differing = _differing(wanted, _generated_files(commit.tree))
-            else:
-                snapshot = _loaded(repo, commit, entry, before.snapshot if before else None)
-                if before and before.advanced(snapshot, commit):
-                    proof = before
-                else:
-                    proof = _Proof(snapshot, commit)
-                differing = proof.differing()
+                before = None
+            snapshot = _loaded(repo, commit, entry, before.snapshot if before else None)
+            is_next = before is not None and before.advanced(snapshot, commit)
+            proof = before if before and is_next else _Proof(snapshot, commit)
+            differing = proof.differing()
         except _Unreadable as error:
             why = f"a file was not valid at this commit: {error}"
             yield replace(verdict, skipped=why, holds=verdict.holds and not verdict.touched)
@@ -289,22 +286,6 @@ def _loaded(
     if snapshot.claim_faults:
         raise _Unreadable(snapshot.claim_faults[0])
     return snapshot
-
-
-def _differing(wanted: Mapping[str, Oid], committed: Mapping[str, Oid]) -> tuple[str, ...]:
-    return tuple(
-        path
-        for path in sorted({*wanted, *committed})
-        if wanted.get(path) != committed.get(path) and not trees.is_readme(path)
-    )
-
-
-def _holds(world: World) -> bool:
-    return any(override.hold for override in world.overrides)
-
-
-def _generated_files(tree: Tree) -> dict[str, Oid]:
-    return {path: child.id for path, child in trees.entries(tree, GENERATED_ROOTS)}
 
 
 def _blob(text: str) -> Oid:

@@ -13,14 +13,13 @@ import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 from typing import TypeAlias
 
 from demandops.base import errors
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, fault
 from demandops.base.quoting import quoted
-from demandops.base.settings import PROPOSAL_LIMIT, RENDER_VERSION
+from demandops.base.settings import PROPOSAL_LIMIT
 from demandops.decide.decision import Decision
 from demandops.decide.state import State
 from demandops.model.demand.demand import Demand
@@ -29,7 +28,6 @@ from demandops.repo.git.repository import PushDenied, StateRepository
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.history.commit_log import RecordedOutcome
-from demandops.repo.history.commit_message import generator_signature
 from demandops.repo.load import ledger_files
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Snapshot
@@ -116,7 +114,9 @@ class Approvals:
         # Before the batch is evaluated: once a branch is gone, nobody can merge it. If a person
         # merged it earlier, the batch is evaluated on a tip that includes the merge.
         for ticket in batch:
-            if (request := _release_request(ticket, state)) is None:
+            if ticket.withdrawn or not ticket.demand.is_release:
+                continue
+            if (request := admit_or_none(state, ticket.demand)) is None:  # it would be refused
                 continue
             for proposal in self.proposals.values():
                 if not releases(request, proposal.requests, state.config):
@@ -127,15 +127,6 @@ class Approvals:
                 # the next check answers the demands, because their branch may be merged already
                 self._changed.append(proposal.branch)
                 ticket.has_released = True
-
-    def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        request = _release_request(by, state) if earlier else None
-        for index, (ticket, result) in enumerate(earlier):
-            if not (request and isinstance(result, Decision)):
-                continue
-            if releases(request, [result.request], state.config):
-                earlier[index] = (ticket, errors.Withdrawn(RELEASED))
-                by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
         """Add a demand to the proposal of the same demand, or to a new one, or answer it."""
@@ -279,7 +270,7 @@ class Approvals:
                 reason,
             )
             title = f"Reject {', '.join(demands)}: {reason}"
-            commit_without_files(commits, [[title]], trailers, now)
+            commits.commit_without_files([[title]], trailers, now)
         if not publish(commits):
             log.info("another writer was first; recording the rejections again")
 
@@ -350,11 +341,7 @@ class Approvals:
     def _has_moved(
         proposal: Proposal, commits: tuple[str, ...], head: str, heads: BranchHeads
     ) -> bool:
-        """Return whether this check has moved or removed the branch.
-
-        A person may have merged the branch just before, which only a main shows that is read after
-        that. So the next check answers.
-        """
+        # by this check: a person may have merged it just before, which only a later main shows
         is_there = heads.branches.get(proposal.branch, "") == head
         return not is_there or proposal.record.commits != commits
 
@@ -492,24 +479,6 @@ class Approvals:
             self._demands.fail(proposal.tickets, error, keep=True)
         self.proposals = {}
         self._forge.close()
-
-
-def _release_request(ticket: Ticket, state: State) -> Demand | None:
-    # None also if the request would be refused
-    if ticket.withdrawn or not ticket.demand.is_release:
-        return None
-    return admit_or_none(state, ticket.demand)
-
-
-def commit_without_files(
-    commits: CommitBatch,
-    paragraphs: list[list[str]],
-    trailers: Iterable[tuple[str, str]],
-    now: datetime,
-) -> None:
-    trailers = [*trailers, *commits.head.trailers, ("Render-Version", str(RENDER_VERSION))]
-    text, author = commit_message.compose(paragraphs, trailers), generator_signature(now)
-    commits.commit_files({}, commits.head.state, text, author, now)
 
 
 def _belongs_to_another(branch: str) -> Refused:

@@ -24,7 +24,7 @@ from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve import agenda
 from demandops.serve.agenda import Agenda, Backoff, RateLimit, What
-from demandops.serve.approvals import Approvals, Result, commit_without_files
+from demandops.serve.approvals import Approvals, Result
 from demandops.serve.demands import Demands
 from demandops.serve.journal import Receipt, Ticket
 from demandops.serve.node_discovery import NodeDiscovery, NodesOf
@@ -246,11 +246,12 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > agenda.LONGEST_EVALUATION_S
-            if number and (is_late or len(json.dumps(ticket.demand.goal)) > agenda.USUAL_LENGTH):
+            is_long = len(json.dumps(ticket.demand.goal)) > agenda.USUAL_LENGTH
+            # it may release a demand of this batch, which must be proposed first
+            proposes = any(isinstance(result, Decision) for _, result in results)
+            if number and (is_late or is_long or (ticket.demand.is_release and proposes)):
                 part, left = part[:number], part[number:] + left
                 break
-            if ticket.demand.is_release:
-                self._approvals.withdraw_released(results, ticket, commits.head.state)
             results.append(self._evaluate(commits, ticket))
             if commits.is_empty:
                 independent = len(results)
@@ -476,7 +477,7 @@ class Worker:
         if commits.is_empty:
             now = self._runtime.now()
             title, why = "Check that the server takes commits", "Why: it refused another commit."
-            commit_without_files(commits, [[title], [why]], [("Operation", "follow")], now)
+            commits.commit_without_files([[title], [why]], [("Operation", "follow")], now)
         self._publish_commits(commits)
         return None
 

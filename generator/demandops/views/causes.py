@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Literal
 
@@ -17,7 +17,7 @@ from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_message import GENERATOR_NAME
 from demandops.repo.load.snapshot import Problem
-from demandops.views.rows import RANKS
+from demandops.views.rows import RANKS, Row, labels_of
 from demandops.views.source import Source, claims_behind, since_of, word_of
 
 Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
@@ -54,17 +54,8 @@ class Cause:
         return any(look in self.command for look in looks) and "| kubectl" not in self.command
 
     @property
-    def labels(self) -> dict[str, Sequence[str]]:
-        """The texts by which a filter finds the cause."""
-        return {
-            "what": [self.what],
-            "why": [self.why, self.told],
-            "cluster": [self.cluster],
-            "release": self.releases,
-            "application": self.applications,
-            "requester": self.requesters,
-            "demand": self.demands,
-        }
+    def row(self) -> Row:
+        return Row(labels_of(asdict(self)))
 
 
 def causes(source: Source) -> list[Cause]:

@@ -27,6 +27,7 @@ from demandops.decide.planning.planner import running_version
 from demandops.model.config.base_model import duration_text, parse_file, parse_time, relative
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
+from demandops.model.demand.demand import Lease
 from demandops.model.ledger.claim import Claim, demand_id, requesters_of
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release, ServiceRelease
@@ -35,7 +36,7 @@ from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.repo.reader import Reader
 from demandops.views import vocabulary
-from demandops.views.rows import Column, Row, TextsOf
+from demandops.views.rows import Column, Row, TextsOf, labels_of
 from demandops.views.source import Source, since_of, word_of, worst_word
 from demandops.views.vocabulary import Json, claim_data, lease_data, subject_text, time_data
 
@@ -75,14 +76,7 @@ class Kind:
         return self.name.capitalize()
 
     def row(self, item: Json) -> Row:
-        # the item's texts by label: `requesters` of an item is its label `requester`
-        labels: dict[str, list[str]] = {}
-        for key, value in item.items():
-            texts = [value] if isinstance(value, str) else value
-            if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
-                label = key[:-1] if key.endswith("s") and not isinstance(value, str) else key
-                labels.setdefault(label, []).extend(texts)
-        more = self.labels(item)
+        labels, more = labels_of(item), self.labels(item)
         more[self.word] = (*more.get(self.word, ()), item["name"])
         for key, words in more.items():
             labels[key] = [*dict.fromkeys((*labels.get(key, ()), *filter(None, words)))]
@@ -263,7 +257,6 @@ def state_of(source: Source, claims: Sequence[Claim]) -> str:
 
 def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
     """Return what items have in common that consist of claims."""
-    leases = [claim.lease for claim in claims if claim.lease]
     nodes = sorted({node for claim in claims for node in nodes_of(claim)})
     return {
         "state": state,
@@ -271,10 +264,14 @@ def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
         "nodes": nodes,
         "domains": domains_of(source, nodes),
         "since": time_data(min(claim.booked for claim in claims)),
-        # the first that ends
-        "lease": lease_data(min(leases, key=lambda lease: lease.until) if leases else None),
+        "lease": lease_data(_first_lease(claims)),
         "ended": None,
     }
+
+
+def _first_lease(claims: Iterable[Claim]) -> Lease | None:  # that ends
+    leases = (claim.lease for claim in claims if claim.lease)
+    return min(leases, key=lambda lease: lease.until, default=None)
 
 
 def _demands(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -305,16 +302,12 @@ def _demand(source: Source, holds: list[Claim] | WaitingDemand, state: str, runs
 
 
 def _leases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    leased = [(id, values) for id, values in _demands(source) if _first_end(values[0])]
-    yield from sorted(leased, key=lambda pair: (_first_end(pair[1][0]), pair[0]))
-
-
-def _first_end(holds: list[Claim] | WaitingDemand) -> str:
-    if isinstance(holds, WaitingDemand):
-        return ""
-    leases = (lease_data(claim.lease) for claim in holds if claim.lease)
-    # "~" sorts a lease that has not started behind every time
-    return min((lease["until"] or "~" for lease in leases if lease), default="")
+    leased = [
+        (lease.until, id, values)
+        for id, values in _demands(source)
+        if id in source.claims_of_demands and (lease := _first_lease(values[0]))
+    ]
+    yield from ((id, values) for _, id, values in sorted(leased, key=lambda each: each[:2]))
 
 
 def _applications(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -591,9 +584,9 @@ def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     nodes: defaultdict[str, list[str]] = defaultdict(list)
     clusters: defaultdict[str, set[str]] = defaultdict(set)
     for node in sorted(source.config.kinds_of_nodes(), key=lambda node: node.id):
-        for domain in source.config.domains_at(node):
+        for cluster, domain in source.config.places_of(node):
             nodes[domain.name].append(node.id)
-            clusters[domain.name].add(node.cluster)
+            clusters[domain.name].add(cluster)
     for name, domain in sorted(source.config.domains.items()):
         item = {
             "name": name,
@@ -604,7 +597,7 @@ def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
             "rules": len(domain.rules),
             "quotas": domain.quotas.model_dump(by_alias=True, exclude_none=True),
             "clusters": sorted(clusters[name]),
-            "nodes": nodes[name],
+            "nodes": [*dict.fromkeys(nodes[name])],
             "file": source.config.file_of(DOMAINS_FILE, name),
         }
         yield name, (item,)
@@ -852,7 +845,7 @@ KINDS: dict[str, Kind] = {
             (
                 *(Column("subject", "Subject", texts_of=_subject, links="held"), STATE, REQUESTERS),
                 *(Column("demand", "Demand", 3, links="demand"), LEASE, SINCE),
-                Column("suspended_by", "Suspended by", 7, texts_of=_suspending, links="override"),
+                Column("suspended_by", "Suspended by", 1, texts_of=_suspending, links="override"),
                 *(_wide("request", "Request"), _wide("file", "File")),
             ),
             _claims,

@@ -77,6 +77,17 @@ class Row:
         return "\n".join(text for texts in self.texts.values() for text in texts)
 
 
+def labels_of(item: Json) -> dict[str, list[str]]:
+    # the item's texts by label: `requesters` of an item is its label `requester`
+    labels: dict[str, list[str]] = {}
+    for key, value in item.items():
+        texts = [value] if isinstance(value, str) else value
+        if isinstance(texts, list | tuple) and all(isinstance(text, str) for text in texts):
+            label = key[:-1] if key.endswith("s") and not isinstance(value, str) else key
+            labels.setdefault(label, []).extend(texts)
+    return labels
+
+
 class Filter:
     """A search text for rows: a row matches if it contains all words of the text.
 

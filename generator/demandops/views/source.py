@@ -244,17 +244,13 @@ class Source:
         return sorted(running, key=lambda each: (each.target.domain.cluster, each.target.name))
 
     @_Derived
-    def targets(self) -> list[tuple[Release, Target]]:
-        return [(planned.release, planned.target) for planned in self.running]
-
-    @_Derived
     def denied(self) -> list[tuple[Release, Override]]:
         keys = (key for key, planned in self.planned.items() if planned is None)
         return [denied for key in keys if (denied := denied_release(self.state, key))]
 
     @_Derived
     def releases(self) -> dict[str, Release]:
-        return {release.name: release for release, _ in self.targets}
+        return {planned.release.name: planned.release for planned in self.running}
 
     @_Derived
     def overrides(self) -> list[Entry]:
@@ -311,7 +307,7 @@ class Source:
         self, caches: Mapping[str, ObjectCache], history: History, changed: ChangedPaths
     ) -> Source:
         """Add what clusters report, as read into their caches."""
-        targets, domains = [target for _, target in self.targets], self.domains
+        targets, domains = [planned.target for planned in self.running], self.domains
         reported = statuses(targets, self.commit, caches, history, changed)
         unread = {
             name: cache.why_unknown(self.watched_objects.get(name, ()))
@@ -336,7 +332,9 @@ class Source:
     def watched_objects(self) -> dict[str, list[ObjectSelector]]:
         """The objects that tell the health of the releases, by cluster."""
         wanted: dict[str, dict[ObjectSelector, None]] = {}
-        for domain in dict.fromkeys((*(t.domain for _, t in self.targets), *self.domains)):
+        for domain in dict.fromkeys(
+            (*(planned.target.domain for planned in self.running), *self.domains)
+        ):
             watched = health_reader(domain).objects_to_watch(domain)
             wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
         return {cluster: [*selectors] for cluster, selectors in wanted.items()}
@@ -346,5 +344,5 @@ class Source:
 
     @property
     def unwatched(self) -> list[str]:
-        used = {target.domain.cluster for _, target in self.targets}
+        used = {planned.target.domain.cluster for planned in self.running}
         return sorted(used - self.watched)

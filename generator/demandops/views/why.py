@@ -26,6 +26,7 @@ from demandops.decide.override_report import affected_releases
 from demandops.decide.state import effect_on_pods
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.config import DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
+from demandops.model.config.override import SELECTED
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import Claim, requesters_of
@@ -62,8 +63,6 @@ _TOLD_APART = KINDS[:3]
 _MOST_LISTED = 8
 # The trailer that names the thing in the commits that are about it.
 _TRAILERS = {"demand": "Demand-Id", "requester": "Requester"}
-# What an override selects by name.
-_SELECTED = ("requester", "application", "connection", "service", "appdef", "node")
 
 
 @dataclass(frozen=True, slots=True)
@@ -467,7 +466,7 @@ def _past(source: Source, reader: Reader, thing: Thing, most: int) -> Json:
         history = PathHistory(started, tuple(about[:most]), more, stopped)
     elif thing.path:
         history = reader.history(thing.path, source.commit, most)
-    if thing.kind in _SELECTED:
+    if thing.kind in SELECTED:
         log, listed = reader.log(source.commit), {entry.commit for entry in history.newest}
         edits = (entry for entry in log if reader.edits(entry, thing.kind, thing.name))
         newest = [*history.newest, *(entry for entry in edits if entry.commit not in listed)]

@@ -144,7 +144,7 @@ def picture(source: Source, wanted: Filter, layout: str) -> dict[str, Any]:
             lit.add(row.item["node"])
             lit_releases.add(row.item["name"])
     marks: dict[str, list[Mark]] = {id: [] for id in known}
-    for release, _ in source.targets:
+    for release in source.releases.values():
         if release.node.id not in marks:
             continue
         text = (

@@ -155,9 +155,7 @@ def _overview(asked: ViewRequest) -> tuple[str, Data]:
     moment = source.now if source.is_newest else source.entry.time
     events = [event for event in asked.events() if event.time <= moment]
     # What is not ready, with a link to the thing or to the releases that it is about.
-    causes = [
-        cause for cause in cause_list.causes(source) if asked.filter.matches(Row(cause.labels))
-    ]
+    causes = [cause for cause in cause_list.causes(source) if asked.filter.matches(cause.row)]
     links = []
     for cause in causes[:_MOST_CAUSES]:
         (kind, name), link = cause.thing, Part(cause.what)

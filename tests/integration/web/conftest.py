@@ -13,7 +13,7 @@ from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.views.causes import Cause
 from demandops.views.causes import causes as causes_of
-from demandops.views.rows import Filter, Row
+from demandops.views.rows import Filter
 from demandops.views.source import Source
 from demandops.web.follower import Follower
 from demandops.web.page_views import LISTS
@@ -80,4 +80,4 @@ def still(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
 
 
 def causes(source: Source, text: str = "") -> list[Cause]:
-    return [cause for cause in causes_of(source) if Filter(text).matches(Row(cause.labels))]
+    return [cause for cause in causes_of(source) if Filter(text).matches(cause.row)]

@@ -218,8 +218,7 @@ def test_views_derived_step_by_step_equal_views_derived_from_scratch(
             shown.look(f"/{name}")
         now = shown.follower.newest
         anew = replace(now, derived={})
-        assert now.targets == anew.targets
-        assert now.claims_of_releases == anew.claims_of_releases
+        assert now.running == anew.running
         for name in LISTS:
             assert sorted(map(str, rows_of(now, name))) == sorted(map(str, rows_of(anew, name)))
 

@@ -8,10 +8,14 @@ import pytest
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.decide.discovery import ClusterNode, discover
+from demandops.decide.state import State
+from demandops.decide.warnings import policy_warnings
 from demandops.model.config import discovered
 from demandops.model.config.discovered import DiscoveredNode
 from demandops.model.config.inventory import Cluster
 from demandops.model.config.load import load
+from demandops.model.ledger.ledger import Ledger
+from demandops.templating.evaluator import EVALUATE
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -118,10 +122,12 @@ def test_whatever_a_cluster_says_the_configuration_stays_valid(
 
 def test_values_and_nodes_that_contradict_other_files_do_not_count() -> None:
     sizes = {"bus1": 3, "bus2": "large", "bus3": "large"}
-    found = [{"id": id, "properties": {"size": size}} for id, size in sizes.items()]
+    found = [{"id": id, "properties": {"size": size, "doors": size}} for id, size in sizes.items()]
     file = nodes([*found, {"id": "bus9"}])
     size = ("- id: cloud\n", "- id: cloud\n    properties: {size: 3}\n")
+    doors = ("prefix: of\n", "prefix: of\n    place: {properties: {doors: {min: 2}}}\n")
     changed = edited("inventory/nodes.yaml", *size) | {"inventory/clusters.yaml": FROM_CLUSTER}
+    changed |= edited("appdefs/object-detection-fusion/appdef.yaml", *doors)
     policy = plain_yaml.load(skeleton()[POLICY])
     policy["domains"][0]["nodes"] = ["vehicle*", "station*", "edge", "cloud", "bus*"]
     policy["domains"].append(
@@ -129,6 +135,9 @@ def test_values_and_nodes_that_contradict_other_files_do_not_count() -> None:
     )
     changed |= {POLICY: json.dumps(policy), PATH: file}
     config = load(configuration(changed))
-    assert [config.nodes[id].properties for id in sizes] == [{"size": 3}, {}, {}]
+    assert [config.nodes[id].properties for id in sizes] == [{"size": 3, "doors": 3}, {}, {}]
     assert "bus9" in config.nodes
     assert "bus9" not in config.domain_of, "two access domains match it"
+    told = "'bus9' is in the access domains 'b' by '*9' and 'perception' by 'bus*'; narrow these "
+    (warning,) = policy_warnings(State(config, Ledger(), EVALUATE))
+    assert str(warning).startswith(f"{POLICY}: {told}")

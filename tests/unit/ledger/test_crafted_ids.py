@@ -22,7 +22,6 @@ from demandops.decide.booking import Drain
 from demandops.decide.checks import collisions
 from demandops.decide.decision import decide
 from demandops.decide.placement.relocation import following_overrides
-from demandops.decide.planning import flows
 from demandops.decide.state import rendered_files
 from demandops.model.config.load import load
 from demandops.model.demand.demand import Requirement
@@ -45,7 +44,7 @@ NODES = "inventory/nodes.yaml"
 
 @pytest.fixture
 def short_digests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    caches = (naming.topic_part, flows.published_topic, ros._number)
+    caches = (naming.topic_part, ros._number)
     monkeypatch.setattr(naming, "MOST_DIGITS", 1)
     for cached in caches:
         cached.cache_clear()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.naming import PATTERN_WORDS
 from demandops.base.quoting import quoted
 from demandops.base.settings import data_folder
-from demandops.cli.formats import Command, output_option, show
+from demandops.cli.formats import output_option, show
 from demandops.cli.output import busy, read_by
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.decide.state import State, try_configuration
@@ -32,16 +32,14 @@ from demandops.repo.merge_check import edited_checkout
 from demandops.templating import charts
 from demandops.templating.evaluator import EVALUATE
 
-
-def _directory(what: str) -> Callable[[Command], Command]:
-    return click.option(
-        "--directory",
-        "-C",
-        type=click.Path(path_type=Path, exists=True, file_okay=False),
-        default=Path(),
-        metavar="DIR",
-        help=f"{what} Default: this folder.",
-    )
+_directory = click.option(
+    "--directory",
+    "-C",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    default=Path(),
+    metavar="DIR",
+    help="Where to write: a checked-out repository. Default: this folder.",
+)
 
 
 @click.group()
@@ -107,7 +105,7 @@ _URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A
     metavar="URL",
     help="The state repo to which the image is proposed.",
 )
-@_directory("The repository of the ROS package.")
+@_directory
 @output_option
 def image(name: str, repository: str, state_repo: str, directory: Path, output: str) -> None:
     """Write a container file and pipelines for a ROS package of your own.
@@ -219,7 +217,7 @@ def _image(text: str) -> Image:
     metavar="ID",
     help="The node of the example demand. Default: an edge server if there is one.",
 )
-@_directory("The checked-out state repo.")
+@_directory
 @output_option
 def application(  # noqa: PLR0913 - as many as options
     name: str,

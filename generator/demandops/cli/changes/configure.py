@@ -29,13 +29,19 @@ from demandops.cli.target import all_names, names_of
 from demandops.decide.booking import Drain
 from demandops.decide.placement import relocation
 from demandops.decide.state import State
+from demandops.model.config import discovered
 from demandops.model.config.base_model import document, matches, parse_file, parse_time, seconds_of
 from demandops.model.config.config import NODES_FILE
-from demandops.model.config.discovered import is_discovered
 from demandops.model.config.entry_patterns import may_match
 from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.load import is_override_name
-from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile, format_time
+from demandops.model.config.override import (
+    OVERRIDES_ROOT,
+    SELECTED,
+    Override,
+    OverrideFile,
+    format_time,
+)
 from demandops.model.ledger.claim import LEDGER_ROOT
 from demandops.repo import reader
 from demandops.repo.history import commit_log
@@ -45,11 +51,10 @@ from demandops.views.vocabulary import Json, override_data
 
 editing = changing(propose_option)
 
-_SELECTED = ("application", "appdef", "service", "connection", "node", "requester")
 selecting = target.name_options(
     {
         name: f"Select this {name}; * matches any text, ? one character. May be repeated."
-        for name in _SELECTED
+        for name in SELECTED
     },
     metavar="NAME",
     multiple=True,
@@ -112,14 +117,11 @@ def _new_name(name: str) -> str:
     )
 
 
-def _image(ctx: click.Context, param: click.Parameter, given: tuple[str, ...]) -> Json | None:
-    pins: Json = {}
-    for text in given:
-        name, _, pin = text.partition("=")
-        if not (name and pin):
-            raise click.BadParameter(f"{quoted(text)} is not NAME=TAG or NAME=sha256:DIGEST")
-        pins[name] = {"digest" if pin.startswith("sha256:") else "tag": pin}
-    return pins or None
+def _image(text: str) -> tuple[str, Json]:
+    name, _, pin = text.partition("=")
+    if not (name and pin):
+        raise ValueError(f"{quoted(text)} is not NAME=TAG or NAME=sha256:DIGEST")
+    return name, {"digest" if pin.startswith("sha256:") else "tag": pin}
 
 
 @override.command()
@@ -144,7 +146,7 @@ def _image(ctx: click.Context, param: click.Parameter, given: tuple[str, ...]) -
     "images",
     metavar="NAME=TAG",
     multiple=True,
-    callback=_image,
+    callback=read_by(_image),
     help="Pin an image of registry/images to a tag or digest.",
 )
 @click.option(
@@ -182,7 +184,8 @@ def create(name: str, values: str | None, options: Options, **given: Any) -> Non
         patch = strict_yaml.load(content, file)
         if not isinstance(patch, dict):
             raise InvalidInput.at("", "must be a mapping of Helm values", file=file)
-    selected = {f"{name}s": given.pop(f"{name}s") for name in _SELECTED}
+    selected = {f"{name}s": given.pop(f"{name}s") for name in SELECTED}
+    given["images"] = dict(given["images"]) or None
     # a flag that is not given is no effect
     more = {field: value for field, value in given.items() if value is not False}
     _create(name, f"Create override {name}", selected, {"values": patch, **more}, options)
@@ -264,7 +267,7 @@ def _end(
             message = "is not valid, so nothing is overridden; correct or remove the file with git"
             raise InvalidInput.at("", message, file=_path_of(name))
         if override is None:
-            hint = target.options_for(repo, name, _SELECTED) or suggestion(name, overrides)
+            hint = target.options_for(repo, name, SELECTED) or suggestion(name, overrides)
             raise InvalidInput.at("", f"there is no override '{name}'{hint}")
         # a person may have changed what the file selects since it was suspended
         selects = [select.model_dump(exclude_none=True).items() for select in override.select]
@@ -306,7 +309,7 @@ def suspend(expires: str | None, options: Options, **selected: tuple[str, ...]) 
     """
     if names := click.get_current_context().args:
         with reader.opened(options.state_repo, only_read=True) as repo:
-            hint = target.options_for(repo, names[0], _SELECTED)
+            hint = target.options_for(repo, names[0], SELECTED)
         raise click.UsageError(f"say by an option what {quoted(names[0])} is{hint}")
     effect = {"expires": expires, "deny": True}
     _create(name_of(selected), f"Suspend {described(selected)}", selected, effect, options)
@@ -369,13 +372,14 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             )
             raise StateRepoError(message)
         path = config.file_of(NODES_FILE, host)
-        if is_discovered(path):
-            verb = "cordon" if drained else "uncordon"
-            way = shlex.join(["kubectl", verb, "-l", f"{NODE_LABEL}={host}"])
-            cluster = config.nodes[host].cluster
-            message = f"'{host}' is as cluster '{cluster}' has it; there, run: {way}"
-            raise StateRepoError(message)
         text = repo.file_reader()(path) or ""
+        if discovered.is_discovered(path):
+            cluster, verb = config.nodes[host].cluster, "cordon" if drained else "uncordon"
+            way = shlex.join(["kubectl", verb, "-l", f"{NODE_LABEL}={host}"])
+            message = f"'{host}' is as cluster '{cluster}' has it; there, run: {way}"
+            if any(node.gone_since for node in discovered.read(text, path) if node.id == host):
+                message = f"'{host}' is drained because cluster '{cluster}' has it no longer"
+            raise StateRepoError(message)
         try:
             changed = strict_yaml.set_flag(text, "nodes", host, "drained", drained)
         except InvalidInput as error:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from itertools import islice
-from typing import Any
+from typing import Any, get_args
 
 import click
 
@@ -19,12 +19,13 @@ from demandops.base.errors import (
 )
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.cli.formats import Table, list_table, output_formats, output_option, show, table_of
+from demandops.cli.formats import Table, list_table, output_formats, output_option, show
 from demandops.cli.output import SIGNS, at_option, busy, errors
 from demandops.cli.target import name_options, state_repo_option
 from demandops.decide.bookkeeping import EntryChange, as_data, bookkeeping_changes
 from demandops.decide.bookkeeping import bookkeeping as derive
 from demandops.decide.state import MergePreview, ReleaseChange, planned_releases, preview
+from demandops.model.demand.demand import Operation
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
 from demandops.repo.history import commit_log
@@ -33,9 +34,8 @@ from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.views.kinds import KINDS, event, rows_of
-from demandops.views.rows import Column
 from demandops.views.source import Source
-from demandops.views.vocabulary import commit_data, time_text
+from demandops.views.vocabulary import commit_data
 
 # ---- ``demandops bookkeeping`` ----
 
@@ -57,44 +57,24 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
     with reader.opened(state_repo) as repo:
         source = Source.read(repo, loaded(repo, at))
     data = as_data(derive(source.state), source.commit)
-    capacity = [
-        {"node": node, "name": name, **amounts}
-        for node, resources in data.get("nodes", {}).items()
-        for name, amounts in resources.items()
-    ]
+    suspended = [row for row in rows_of(source, "claims") if row.item["suspended_by"]]
+    waiting = [row for row in rows_of(source, "demands") if row.item["state"] == "waiting"]
     text: list[str | Table] = []
-    for name in ("services", "connections"):
-        table = list_table(KINDS[name], rows_of(source, name), source.now, wide=True)
-        text += [replace(table, title=name.title(), empty="(nothing)", whole=output == "wide"), ""]
-    for title, columns, items in (
-        ("Suspended", _SUSPENDED, data.get("suspended")),
-        ("Capacity", _CAPACITY, capacity),
-        ("Waiting for room", _WAITING, data.get("waiting")),
+    for title, name, rows in (
+        ("Services", "services", rows_of(source, "services")),
+        ("Connections", "connections", rows_of(source, "connections")),
+        *([("Suspended", "claims", suspended)] if suspended else []),
+        *([("Waiting for room", "demands", waiting)] if waiting else []),
     ):
-        if items:
-            text += [table_of(columns, items, source.now, title=title), ""]
+        table = list_table(KINDS[name], rows, source.now, wide=True)
+        text += [replace(table, title=title, empty="(nothing)", whole=output == "wide"), ""]
+    for node, resources in data.get("nodes", {}).items():
+        text += [
+            f"{node}: {amounts['requested']} of {amounts['capacity']} {name} requested"
+            for name, amounts in resources.items()
+        ]
     show(output, data, [*text, f"at {source.commit}"])
 
-
-_SUSPENDED = (
-    Column("id", "Subject", texts_of=lambda claim, now: "{kind} {id}".format(**claim)),
-    Column("demand", "Demand", 2),
-    Column("requesters", "Requesters", 1),
-    Column("override", "By", 3),
-    Column("reason", "Reason", 4),
-)
-_CAPACITY = (
-    Column("node", "Node"),
-    Column("name", "Resource"),
-    Column("requested", "Requested"),
-    Column("capacity", "Capacity"),
-)
-_WAITING = (
-    Column("demand", "Demand"),
-    Column("requesters", "Requesters", 2),
-    Column("since", "Since", 1, texts_of=lambda demand, now: time_text(demand["since"])),
-    Column("priority", "Priority", 1),
-)
 
 # ---- ``demandops diff`` ----
 
@@ -203,16 +183,16 @@ def entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
 
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
-    *("join", "shutdown", "put", "release", "renew", "expire", "wait", "decommission", "drain"),
-    *("follow", "discover", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
+    *get_args(Operation),
+    *("follow", "discover", "expire-override", "reject", "upgrade", "init", "by-hand"),
 )
 
-_TRAILERS = {
-    "requester": "Requester",
-    "application": "Application",
-    "connection": "Connection",
-    "demand": "Demand-Id",
-}
+# The filters by what the trailers of a commit name.
+_NAMED = ("requester", "application", "connection", "demand")
+
+
+def _named(entry: LogEntry, kind: str) -> Sequence[str]:
+    return entry.trailers.get(KINDS[f"{kind}s"].trailer, ())
 
 
 def time_of(ctx: click.Context, param: click.Parameter, text: str | None) -> datetime | None:
@@ -301,12 +281,11 @@ def log(
                     "`demandops status` lists the current ones"
                 )
         commits = repo.log(commit_range, path) if path else repo.log(commit_range)
-        wanted = [(name, given[name]) for name in (*_TRAILERS, "node") if given[name] is not None]
+        wanted = [(name, given[name]) for name in (*_NAMED, "node") if given[name] is not None]
 
         def is_about(entry: LogEntry, kind: str, name: str) -> bool:
-            named = entry.trailers.get(_TRAILERS.get(kind, ""), ())
             # the trees of a commit are read last
-            return name in named or (
+            return name in _named(entry, kind) or (
                 (kind == "node" and repo.changes_node(entry.commit, name))
                 or (kind != "demand" and repo.edits(entry, kind, name))
             )
@@ -329,10 +308,10 @@ def log(
 
 def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
     # a name that no commit is about is probably misspelled
-    names: dict[str, set[str]] = {name: set() for name in _TRAILERS if given[name] is not None}
+    names: dict[str, set[str]] = {name: set() for name in _NAMED if given[name] is not None}
     for entry in repo.log() if names else ():
         for name, values in names.items():
-            values.update(entry.trailers.get(_TRAILERS[name], ()))
+            values.update(_named(entry, name))
     faults = [
         fault(
             f"--{name}",

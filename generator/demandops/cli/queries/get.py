@@ -40,10 +40,8 @@ FILTERS = ("node", "requester", "application", "domain")
 
 # What people mean by other words.
 _MEANT = {"app": "applications", "commit": "events", "type": "appdefs", "vehicle": "nodes"}
-# The kinds of which a shell completes the names, with the kind that has the same names.
-_COMPLETED = {"leases": "demands", "services": "releases"} | dict.fromkeys(
-    ("applications", "connections", "demands", "nodes", "overrides", "proposals", "releases"), ""
-)
+# The kind whose names a shell completes for another kind.
+_SAME_NAMES = {"leases": "demands", "services": "releases"}
 
 
 def _kind_named(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
@@ -59,8 +57,7 @@ def _kind_named(ctx: click.Context, param: click.Parameter, value: str | None) -
 
 def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     kind = ctx.params.get("kind") or ""
-    same = _COMPLETED.get(kind)
-    return [] if same is None else names_of(same or kind)(ctx, param, incomplete)
+    return names_of(_SAME_NAMES.get(kind, kind))(ctx, param, incomplete)
 
 
 @click.command()

@@ -163,10 +163,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
 @click.argument(
     "name",
     metavar="NAME|PATH",
-    shell_complete=names_of(
-        *("releases", "applications", "connections", "demands", "nodes"),
-        *("appdefs", "requesters", "overrides", "domains", "services", "proposals"),
-    ),
+    shell_complete=names_of(*(f"{kind}s" for kind in KINDS)),
 )
 @state_repo_option
 @at_option

@@ -15,13 +15,7 @@ from demandops.decide.planning.overrides import with_overridden_nodes
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.inventory import id_in_domain
-from demandops.model.demand.demand import (
-    AnyDemand,
-    Application,
-    Held,
-    InputTopic,
-    Item,
-)
+from demandops.model.demand.demand import AnyDemand, Application, Held, InputTopic, Item
 from demandops.model.ledger.ledger import Ledger
 
 

@@ -9,7 +9,6 @@ that a person approves claims before they are booked.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 
 from demandops.base.errors import Fault, fault
 from demandops.connections.connection import Connection
@@ -17,8 +16,8 @@ from demandops.model.config.base_model import duration_text, matches, seconds_of
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain, Rule
 from demandops.model.demand.demand import Application, Demand, Item, Lease
-from demandops.model.ledger.claim import Claim, requesters_of
-from demandops.model.ledger.ledger import Ledger
+from demandops.model.ledger.claim import requesters_of
+from demandops.model.ledger.ledger import ClaimChange, Ledger
 
 # pairs of a rule's field, such as ``nodes``, and a value that this field must allow
 Access = list[tuple[str, str]]
@@ -178,21 +177,17 @@ def lease_in(domain: AccessDomain, request: Demand) -> Lease | None:
 
 
 def approval(
-    request: Demand, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
+    request: Demand, changes: Iterable[ClaimChange], config: Config
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return what requires a person's approval, and the rules that let requesters do without it.
-
-    ``changes`` are the changed claims as (before, after).
-    """
+    """Return what requires a person's approval, and the rules that let requesters do without it."""
     if not request.adds_claims:
         return (), ()
     listed = set(request.subjects())  # without the claims of overrides, which need no approval
     reasons, exempting = dict[str, None](), dict[str, None]()
-    for before, after in changes:
-        if after is None or after.subject not in listed:
-            continue
+    for change in changes:
         # a renewal needs no approval, because the person approved what it renews
-        if before is not None and replace(after, lease=before.lease) == before:
+        after = change.after
+        if after is None or after.subject not in listed or change.only_renews:
             continue
         if isinstance(after.held, Application):
             appdef = config.appdefs.get(after.held.appdef)

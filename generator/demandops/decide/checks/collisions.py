@@ -191,8 +191,6 @@ _TOPIC = "topic"
 # ledger take long to find, so they follow each change, in a map that shares what did not change.
 Names: TypeAlias = "HashTrieMap[Name, HashTrieSet[ReleaseKey]]"
 
-NONE: Names = HashTrieMap()
-
 _REMEDY = "use another id, or wait until the other is released"
 
 
@@ -214,7 +212,7 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
 
 def all_names(world: World) -> Names:
     keys = (key for claims in world.ledger.claims.values() for key in keys_of_claims(world, claims))
-    return with_keys(NONE, world, dict.fromkeys(keys))
+    return with_keys(HashTrieMap(), world, dict.fromkeys(keys))
 
 
 def with_keys(names: Names, world: World, keys: Iterable[ReleaseKey]) -> Names:

@@ -33,7 +33,7 @@ from demandops.model.config.appdef import Service
 from demandops.model.demand.demand import Application, Demand, Item
 from demandops.model.demand.goals import items_of
 from demandops.model.ledger.claim import Claim
-from demandops.model.ledger.ledger import World
+from demandops.model.ledger.ledger import ClaimChange, World
 
 # The time of a claim that is judged but not booked
 _NEVER = datetime.max.replace(tzinfo=timezone.utc)
@@ -315,7 +315,8 @@ def may_wait(request: Demand, state: State, checkpoint: Callable[[], None]) -> b
             )
             claims = (Claim(held, "", request.id, item.requesters, _NEVER) for held in waiting)
             # A person approves only what can be booked at once, so what needs approval cannot wait.
-            if all(permission.approval(request, [(None, c)], state.config)[0] for c in claims):
+            changes = (ClaimChange(None, claim) for claim in claims)
+            if all(permission.approval(request, [each], state.config)[0] for each in changes):
                 return False
     return True
 

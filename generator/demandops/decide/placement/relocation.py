@@ -14,7 +14,7 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.decide import carriers
 from demandops.decide.admission import admission, permission
-from demandops.decide.booking import Drain, Restoration, conflicts, request_for
+from demandops.decide.booking import Drain, conflicts, request_for
 from demandops.decide.checks import collisions, forbidden
 from demandops.decide.checks.collisions import Names
 from demandops.decide.checks.forbidden import Need, Usage
@@ -32,7 +32,6 @@ from demandops.model.ledger.ledger import (
     Ledger,
     World,
     claim_changes,
-    ledger_of,
 )
 
 # ---- when an application moves, the connections of its demands follow, with type and options ----
@@ -246,9 +245,10 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
         if app is not None and change(app) != app
     ]
     keys, stays = list[ClaimKey](), list[tuple[str, str]]()
-    names = collisions.all_names(world) if moving else collisions.NONE
-    # applications that share a service must move at the same time
-    groups = [moving] if moving else []
+    if not moving:
+        return LedgerUpdate(world.ledger, (), ())
+    names = collisions.all_names(world)
+    groups = [moving]  # applications that share a service must move at the same time
     while groups:
         ids = groups.pop(0)
         after, changes = world, dict[str, tuple[ClaimChange, ...]]()
@@ -286,15 +286,6 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
     return LedgerUpdate(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
 
 
-def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    if not any(override.node for override in world.overrides) and not any(
-        claim.is_on_application and claim.application.moved for claim in request.claims
-    ):
-        return request
-    ledger = replace(ledger_of(request.claims), ended=world.ledger.ended)
-    return replace(request, claims=tuple(following_overrides(replace(world, ledger=ledger)).ledger))
-
-
 def _faults(
     before: World, after: World, changes: tuple[ClaimChange, ...], names: Names
 ) -> Iterator[Fault]:
@@ -304,8 +295,9 @@ def _faults(
         if claim is None:
             continue
         request, others = request_for(claim), after.ledger.replace(claim.key, None)
-        yield from admission.faults(request, after.config)
-        yield from permission.faults(request, after.config)
+        if claim.keeping_override is None:  # no requester demands what an override keeps
+            yield from admission.faults(request, after.config)
+            yield from permission.faults(request, after.config)
         yield from conflicts(request.demanded[0], others)
         override = overrides.suspended_by(claim, after)
         if override and change.before and not overrides.suspended_by(change.before, before):

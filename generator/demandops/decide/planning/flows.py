@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache, reduce
+from functools import reduce
 from graphlib import CycleError, TopologicalSorter
 from itertools import product
 from typing import NamedTuple
@@ -55,13 +55,6 @@ def distinguishing_text(config: Config, role: str, topic: InputTopic, version: s
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
     return " ".join(filter(None, (topic.topic if further else "", version)))
-
-
-# A fusion reads hundreds of such topics, and each demand plans the fusion again.
-@lru_cache(maxsize=65_536)
-def published_topic(pattern: str, source: str, distinguishing: str) -> InputTopic:
-    instance = naming.topic_part(source, distinguishing)
-    return InputTopic(pattern.replace("{instance}", instance), source)
 
 
 def usual_topic(config: Config, source: str, role: str) -> str | None:
@@ -223,11 +216,9 @@ def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[
         for topic in app.inputs.get(role, ()):
             text = distinguishing_text(config, role, topic, version) if producer.root else ""
             node = topic.source if producer.at_source else node_of(app, producer, topic.source)
-            yield PublishedTopic(
-                published_topic(pattern, topic.source, text),
-                node,
-                (role, topic.topic, topic.source),
-            )
+            instance = naming.topic_part(topic.source, text)
+            made = InputTopic(pattern.replace("{instance}", instance), topic.source)
+            yield PublishedTopic(made, node, (role, topic.topic, topic.source))
 
 
 def flows(config: Config, app: Application) -> list[Flow]:

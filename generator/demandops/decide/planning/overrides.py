@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 
-from demandops.base.naming import Subject, SubjectKind
+from demandops.base.naming import Subject
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override, Selector, Shaping
@@ -107,23 +107,6 @@ class UnsuspendedClaims(Ledger):
     def get(self, key: ClaimKey) -> Claim | None:
         claim = Ledger.get(self, key)
         return claim if claim and self._is_active(claim) else None
-
-    def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
-        booked = Ledger.versions_asked(self, application, known)
-        asked = {
-            word
-            for word in booked
-            if any(self.get(key) for key in self.index.get(("version", application, word)) or ())
-        }
-        # The ledger only counts the claims that ask for none of the known versions. Suspended
-        # claims must not count, so each of these claims is looked at.
-        claims = self.claims.get(Subject(SubjectKind.APPLICATION, application)) or ()
-        if "" in booked and any(
-            claim.application.version not in booked - {""} and self._is_active(claim)
-            for claim in claims
-        ):
-            asked.add("")
-        return asked
 
     def ids_with(self, by: By, *words: str) -> tuple[str, ...]:
         return tuple(sorted({claim.subject.id for claim in self.each_with(by, *words)}))

@@ -40,6 +40,7 @@ from demandops.model.config.inventory import (
     PropertyName,
     PropertyValue,
     Resources,
+    comparable_kind,
     kind_of,
 )
 
@@ -99,16 +100,23 @@ def text_of(nodes: Iterable[DiscoveredNode]) -> str:
 
 
 def read_nodes(
-    reader: ConfigReader, clusters: Mapping[str, Cluster], listed: Mapping[str, Node]
+    reader: ConfigReader,
+    clusters: Mapping[str, Cluster],
+    listed: Mapping[str, Node],
+    required: Iterable[Mapping[str, object]],
 ) -> dict[str, Node]:
-    """Return the discovered nodes that nobody lists; collect the faults of entries and files."""
+    """Return the discovered nodes that nobody lists; collect the faults of entries and files.
+
+    ``required`` has the properties that definitions require of nodes.
+    """
     nodes, places = dict[str, Node](), reader.places[NODES_FILE]
+    examples = [pattern.example for pattern in reader.patterns[NODES_FILE]]
     for name, cluster in sorted(clusters.items()):
         if cluster.nodes == "listed":  # a file that is left over is removed by the generator
             continue
         pattern, path = _pattern(reader, cluster), path_of(name)
         try:
-            _ = pattern.example  # so that the faults of the entry are those of its file
+            examples.append(pattern.example)  # the faults of the entry are those of its file
             known = read(reader.files.get(path), path)
         except InvalidInput as error:
             reader.faults += error.faults
@@ -125,8 +133,8 @@ def read_nodes(
                 nodes[node.id] = here.entry(node.id, own)
             except InvalidInput as error:
                 reader.faults += error.faults
-    examples = (pattern.example for pattern in reader.patterns[NODES_FILE])
-    return dict(_of_one_kind(nodes, [*listed.values(), *examples]))
+    by_people = [*(node.properties for node in (*listed.values(), *examples)), *required]
+    return dict(_of_one_kind(nodes, by_people))
 
 
 def _pattern(reader: ConfigReader, cluster: Cluster) -> EntryPattern[Node]:
@@ -137,14 +145,17 @@ def _pattern(reader: ConfigReader, cluster: Cluster) -> EntryPattern[Node]:
     return EntryPattern("{n}", "id", Node, data, file, (f"{place}.discovery.entry",))
 
 
-def _of_one_kind(nodes: Mapping[str, Node], listed: Iterable[Node]) -> Iterator[tuple[str, Node]]:
+def _of_one_kind(
+    nodes: Mapping[str, Node], by_people: Iterable[Mapping[str, object]]
+) -> Iterator[tuple[str, Node]]:
     # A property has values of one type. A label with an odd value must not make people's files
     # invalid, so they decide about the type, else most nodes do; other values do not count.
     kinds = defaultdict[str, Counter[Kind | None]](Counter)
-    for weight, group in ((1, nodes.values()), (len(nodes) + 1, listed)):
-        for node in group:
-            for name, value in node.properties.items():
-                kinds[name][kind_of(value)] += weight
+    own = (node.properties for node in nodes.values())
+    for weight, group in ((1, own), (len(nodes) + 1, by_people)):
+        for properties in group:
+            for name, value in properties.items():
+                kinds[name][comparable_kind(value)] += weight
     common = {name: counts.most_common(1)[0][0] for name, counts in kinds.items()}
     for id, node in nodes.items():
         fitting = {n: v for n, v in node.properties.items() if kind_of(v) == common[n]}

@@ -106,6 +106,10 @@ class Selector(FrozenModel):
         )
 
 
+# What an override selects by name: "application", "node" and so on.
+SELECTED = tuple(field[:-1] for field in Selector.model_fields if field != "labels")
+
+
 class OverrideFile(FileModel):
     """``overrides/<name>.yaml``. Of several overrides for a release, the highest priority wins."""
 

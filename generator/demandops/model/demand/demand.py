@@ -323,8 +323,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ("node", topic.source)
             if not topic.further:
                 yield ("usual", topic.source, role)
-        if self.version:
-            yield ("version", self.id, self.version)
         for delivery in self.deliver:
             yield ("node", delivery.node)
 

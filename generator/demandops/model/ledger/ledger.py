@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from operator import attrgetter
@@ -41,7 +41,6 @@ By = Literal[
     "reads",  # the application of an output that is an input
     "from",  # the node of which it reads a topic, or carries one
     "usual",  # source and role
-    "version",  # application and version
     "link",  # type of the connection, and one of its nodes
     "broker",  # the node
     "route",  # the words of a RouteKey
@@ -93,12 +92,10 @@ class Ledger:
         first = self.first_claim(Subject(SubjectKind.CONNECTION, id))
         return first.connection if first else None
 
-    def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
+    def versions_asked(self, application: str, known: Container[str]) -> set[str]:
         # an empty text stands for claims that ask for no version, or for an unknown one
-        by_version = {word: self.index.get(("version", application, word)) for word in known}
-        counts = {word: len(keys) for word, keys in by_version.items() if keys}
-        others = len(self.application_claims(application)) > sum(counts.values())
-        return {*counts, ""} if others else {*counts}
+        asked = {claim.application.version for claim in self.application_claims(application)}
+        return {word if word in known else "" for word in asked}
 
     def keys_with(self, by: By, *words: str) -> Collection[ClaimKey]:
         return self.index.get((by, *words)) or ()

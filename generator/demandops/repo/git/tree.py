@@ -11,7 +11,7 @@ from itertools import islice
 
 import pygit2
 from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
-from pygit2.enums import ConfigLevel, FileMode, SortMode
+from pygit2.enums import ConfigLevel, DeltaStatus, FileMode, SortMode
 
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import quoted
@@ -174,33 +174,24 @@ def differences(
     Without ``roots``, all files are compared. A file whose mode alone changed, and a file deeper
     than :data:`MAX_DEPTH`, is left out. Equal subtrees are not read.
     """
-    if not roots:
-        yield from _differences_below(before, after, "")
-    for root in roots:
-        yield from _differences_at(entry(before, root), entry(after, root), root)
-
-
-def _differences_below(
-    before: Tree | None, after: Tree | None, prefix: str
-) -> Iterator[tuple[str, Oid | None]]:
-    old = {printable(child.raw_name or b""): child for child in before or ()}
-    new = {printable(child.raw_name or b""): child for child in after or ()}
-    for name in sorted({*old, *new}):
-        yield from _differences_at(old.get(name), new.get(name), f"{prefix}{name}")
-
-
-def _differences_at(
-    old: Object | None, new: Object | None, path: str
-) -> Iterator[tuple[str, Oid | None]]:
-    if old is not None and new is not None and old.id == new.id:
+    if before is not None and after is not None:
+        diff = before.diff_to_tree(after)
+    elif (tree := after if before is None else before) is not None:
+        diff = tree.diff_to_tree(swap=before is None)
+    else:
         return
-    if path.count("/") < MAX_DEPTH and (isinstance(old, Tree) or isinstance(new, Tree)):
-        before, after = (child if isinstance(child, Tree) else None for child in (old, new))
-        yield from _differences_below(before, after, f"{path}/")
-    if new is not None and not isinstance(new, Tree):
-        yield path, new.id
-    elif old is not None and not isinstance(old, Tree):
-        yield path, None
+    below, changed = tuple(f"{root}/" for root in roots), dict[str, Oid | None]()
+    for delta in diff.deltas:
+        is_gone = delta.status == DeltaStatus.DELETED
+        path = printable((delta.old_file if is_gone else delta.new_file).raw_path)
+        if path.count("/") > MAX_DEPTH or (below and not f"{path}/".startswith(below)):
+            continue
+        # a file that became a link is one that is gone and one that is new
+        if is_gone:
+            changed.setdefault(path, None)
+        elif delta.old_file.id != delta.new_file.id:
+            changed[path] = delta.new_file.id
+    yield from changed.items()
 
 
 def is_readme(path: str) -> bool:

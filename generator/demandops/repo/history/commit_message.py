@@ -66,6 +66,11 @@ def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
     return "\n\n".join(text for text in (*body, "\n".join(last)) if text) + "\n"
 
 
+def of_generator(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
+    # each commit says by which version the files at it are rendered
+    return compose(paragraphs, [*trailers, ("Render-Version", str(RENDER_VERSION))])
+
+
 def parse(message: str) -> MessageText:
     lines = message.split("\n")
     whys = (line.removeprefix(_WHY) for line in lines if line.startswith(_WHY))
@@ -185,9 +190,8 @@ def of_decision(
         ("Request-Id", request.id),
         *((APPROVED_BY, rule) for rule in decision.approved_by),
         *override_trailers(decision.overrides, keys),
-        ("Render-Version", str(RENDER_VERSION)),
     ]
-    return compose(paragraphs, trailers)
+    return of_generator(paragraphs, trailers)
 
 
 def time_text(at: datetime) -> str:
@@ -331,9 +335,8 @@ def of_follow(
         ("Follows", cause),
         ("Since", since),
         *more,
-        ("Render-Version", str(RENDER_VERSION)),
     ]
-    return compose(paragraphs, trailers)
+    return of_generator(paragraphs, trailers)
 
 
 def rejection_trailers(
@@ -366,9 +369,8 @@ def of_override_end(
         *override_trailers([override.path], keys),
         *demand_trailers(keys),
         *more,
-        ("Render-Version", str(RENDER_VERSION)),
     ]
-    return compose(paragraphs, trailers)
+    return of_generator(paragraphs, trailers)
 
 
 def of_discovery(found: Sequence[Discovered], releases: tuple[ReleaseChange, ...]) -> str:
@@ -392,9 +394,8 @@ def of_discovery(found: Sequence[Discovered], releases: tuple[ReleaseChange, ...
     trailers = [
         ("Operation", "discover"),
         *(("Cluster", name) for name in names),
-        ("Render-Version", str(RENDER_VERSION)),
     ]
-    return compose(paragraphs, trailers)
+    return of_generator(paragraphs, trailers)
 
 
 def override_trailers(paths: Iterable[str], keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:

@@ -306,11 +306,6 @@ class Followed:
     # the claims that overrides changed, or that were put back
     keys: tuple[ClaimKey, ...] = ()
 
-    @property
-    def must_commit(self) -> bool:
-        # also to say which configuration is in effect
-        return bool(self.change.files) or not self.snapshot.is_told
-
 
 def newest_of_generator(repo: Repository, tip: Oid) -> LogEntry | None:
     line = commit_log.first_parents(repo, tip)

@@ -28,7 +28,6 @@ from demandops.decide.state import (
     State,
     planned_releases,
     preview,
-    render_faults,
     rendered_files,
     try_configuration,
 )
@@ -380,11 +379,7 @@ class _Edit:
             yield from faults_of_edit(old, state, written.values())
 
     def rendered(self, state: State) -> dict[str, str]:
-        try:
-            return rendered_files(state, self.generated_before)
-        except InvalidInput as error:
-            faults = render_faults(state, state.evaluate, self.changed)
-            raise InvalidInput(faults or error.faults) from None
+        return rendered_files(state, self.generated_before, edited=self.changed)
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:
         # a person must apply these files

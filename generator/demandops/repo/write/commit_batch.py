@@ -79,15 +79,15 @@ class CommitBatch:
         self._settled = []
         self.awaited = self.awaited or decision.awaited
         author = commit_message.author(decision, received)
-        return self.commit_files(decision.files, decision.state, text, author, now)
+        return self.commit_files(decision.files, decision.state, text, now, author)
 
     def commit_files(
         self,
         files: Mapping[str, str | None],
         state: State,
         text: str,
-        author: Signature,
         now: datetime,
+        author: Signature | None = None,  # if it is not the generator
     ) -> str:
         committer = commit_message.generator_signature(now)
         if signed_off_by := state.config.repo_settings.signed_off_by:
@@ -97,7 +97,11 @@ class CommitBatch:
                 new = self._repository.new
                 tree = new.add_tree(self._tree, files)
                 commit = new.add_commit(
-                    self._repository.signer, (author, committer), text, tree, [self.head.commit]
+                    self._repository.signer,
+                    (author or committer, committer),
+                    text,
+                    tree,
+                    [self.head.commit],
                 )
                 self._tree = trees.commit_of(self._objects, commit).tree
                 break
@@ -121,6 +125,12 @@ class CommitBatch:
         )
         return str(commit)
 
+    def commit_without_files(
+        self, paragraphs: list[list[str]], trailers: commit_message.Trailers, now: datetime
+    ) -> None:
+        text = commit_message.of_generator(paragraphs, [*trailers, *self.head.trailers])
+        self.commit_files({}, self.head.state, text, now)
+
     def record_in_next_commit(self, operation: str, outcome: commit_log.Settled) -> None:
         # The process may die before it answers the demand. After a restart, it must not evaluate
         # the demand again, because later demands could change the outcome.
@@ -132,7 +142,7 @@ class CommitBatch:
         The commit also says which configuration is in effect, if that has changed.
         """
         self.head, before, change = followed.snapshot, followed.before, followed.change
-        if not followed.must_commit:
+        if not change.files and self.head.is_told:
             return
         overrides = edits.changed_override_files(before.state, self.head.state)
         of_overrides = commit_message.override_trailers(
@@ -159,7 +169,7 @@ class CommitBatch:
             ],
         )
         author = commit_log.follow_author(causes, now)
-        self.commit_files(change.files, self.head.state, text, author, now)
+        self.commit_files(change.files, self.head.state, text, now, author)
         title = text.partition("\n")[0]
         self.followed = one_line(", ".join([title, *(path for _, path in of_overrides)]))
 
@@ -182,7 +192,7 @@ class CommitBatch:
                 if self.read(path) != wanted.get(path):
                     files[path] = wanted.get(path)
         text = commit_message.of_discovery(found, change.releases)
-        self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
+        self.commit_files(change.files, state, text, now)
         log.info("%s", text.partition("\n")[0])
 
     def end_override(self, override: Override, now: datetime) -> None:
@@ -193,7 +203,7 @@ class CommitBatch:
         change = snapshots.render_all(self._tree, state, applied.files)
         more = self.head.trailers
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
-        self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
+        self.commit_files(change.files, state, text, now)
 
     def drain(self, node: str, after: str, operation: str, now: datetime) -> Decision:
         # it begins with the application that follows ``after``; if none can move, nothing changes
@@ -210,7 +220,7 @@ class CommitBatch:
             more = [*caused_by, *self.head.trailers]
             text = commit_message.of_decision(decision, operation, now, more)
             author = commit_log.follow_author(causes, now)
-            self.commit_files(decision.files, decision.state, text, author, now)
+            self.commit_files(decision.files, decision.state, text, now, author)
         return decision
 
     def publish(self) -> bool:
