@@ -234,13 +234,15 @@ def _read_packages(folders: dict[str, Path]) -> dict[str, Package]:
 def _name_of(folder: Path) -> str:
     manifest = folder / "package.xml"
     text = manifest.read_text(encoding="utf-8", errors="replace") if manifest.is_file() else ""
+    text = re.sub("<!--.*?-->", "", text, flags=re.DOTALL)
     named = re.search(r"<name>\s*(.*?)\s*</name>", text)
     name = named[1] if named else folder.name
     if not re.fullmatch("[a-z][a-z0-9_]*", name):
         raise Refused(f"{folder}: {name!r} is no name of a package; rename the folder")
-    # a module of another kind would be removed with what an earlier build installed
-    known = importlib.util.find_spec(name)
+    # what is no package of messages would be removed with what an earlier build installed
+    known, share = importlib.util.find_spec(name), PREFIX / "share" / name
     other = known is not None and known.origin is not None and not (SITE / name / "msg").is_dir()
+    other = other or (share.is_dir() and not (share / "msg").is_dir())
     if name in PACKAGES or other or any(SITE.glob(f"ros_{name}-*.dist-info")):
         raise Refused(f"{folder}: {name} is installed already; leave it out")
     return name

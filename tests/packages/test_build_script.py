@@ -46,8 +46,8 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
     (prefix / "include").mkdir(parents=True)
     (prefix / "include" / "Python.h").touch()
-    for wheel in ("geometry_msgs", "std_msgs"):
-        (prefix / "share" / wheel / "msg").mkdir(parents=True)
+    for shared in ("geometry_msgs/msg", "std_msgs/msg", "ament_index/resource_index"):
+        (prefix / "share" / shared).mkdir(parents=True)
     monkeypatch.setattr(sysconfig, "get_path", lambda name: str(prefix / name))
     record = prefix / "share" / "demandops" / "interfaces.json"
     kept = record.with_name("messages")

@@ -19,7 +19,8 @@ VALUE = "[A-Za-z0-9._-]+"
 
 
 def names(text: str) -> list[str]:
-    return [*dict.fromkeys(_PLACEHOLDER.findall(text))]
+    """Return the names of the placeholders in ``text``, also one that is there twice."""
+    return _PLACEHOLDER.findall(text)
 
 
 def is_pattern(id: object) -> bool:
@@ -46,7 +47,7 @@ def unknown_names(
 ) -> Iterator[tuple[str, str]]:
     """Yield each placeholder that is none of ``known``, after the path where it stands."""
     for place, text in texts(data, path):
-        yield from ((place, name) for name in names(text) if name not in known)
+        yield from ((place, name) for name in dict.fromkeys(names(text)) if name not in known)
 
 
 def filled(data: Any, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
@@ -69,12 +70,15 @@ def filled(data: Any, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
 
 def values_in(text: str, made: str, value: str = VALUE) -> dict[str, str] | None:
     """Return the values with which ``text`` becomes ``made``; ``None`` if none do."""
-    match = _expression(text, value).fullmatch(made)
+    expression, others = _expression(text, value)
+    # else each way to divide a long text would be tried, for one character that no value has
+    match = expression.fullmatch(made) if re.sub(value, "", made) == others else None
     return match.groupdict() if match else None
 
 
 @lru_cache(maxsize=65_536)
-def _expression(text: str, value: str) -> re.Pattern[str]:
+def _expression(text: str, value: str) -> tuple[re.Pattern[str], str]:
+    """Return the expression of all that ``text`` may become, and the characters of no value."""
     expression, seen = "", set[str]()
     for index, part in enumerate(_PLACEHOLDER.split(text)):  # texts and names in turn
         if index % 2 == 0:
@@ -82,7 +86,7 @@ def _expression(text: str, value: str) -> re.Pattern[str]:
         else:
             expression += f"(?P={part})" if part in seen else f"(?P<{part}>{value})"
             seen.add(part)
-    return re.compile(expression)
+    return re.compile(expression), re.sub(value, "", _PLACEHOLDER.sub("", text))
 
 
 def example_of(id: str, value: str) -> str:

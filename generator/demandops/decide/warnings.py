@@ -414,6 +414,10 @@ def policy_warnings(world: State) -> Iterator[Fault]:
     yield from _approvals_not_needed(config)
     yield from _open_by_host_network(config)
     yield from _connections_no_longer_allowed(world)
+    for id in sorted(config.nodes.keys() - config.domain_of.keys()):  # for a listed one, a fault
+        if problem := config.unlisted.of_several_domains(id):
+            message = f"{quoted(id)} {problem}, as until then it is in none"
+            yield fault("", message).within(config.place_of(DOMAINS_FILE))
     for (id, resource), used in sorted(world.usage().amounts.items()):
         node = config.nodes.get(id)
         most = node.most(resource) if node else None
@@ -489,16 +493,16 @@ def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
     nodes = [
-        (domain.name, node)
+        (domain.name, node.id, cluster, node)
         for node in config.kinds_of_nodes()
         if node.host_network
-        for domain in config.domains_at(node)
+        for cluster, domain in config.places_of(node)
     ]
-    nodes.sort(key=lambda pair: (pair[0], pair[1].id))
+    nodes.sort(key=lambda each: each[:3])
     # Kubernetes applies a NetworkPolicy only to pods with their own network.
     for name, group in groupby(nodes, key=lambda pair: pair[0]):
         if config.domains[name].network == "namespace":
-            ids = [node.id for _, node in group]
+            ids = [*dict.fromkeys(id for _, id, *_ in group)]
             listed = ", ".join(f"'{id}'" for id in ids[:_MOST_NODES])
             if len(ids) > _MOST_NODES:
                 listed += f" and {len(ids) - _MOST_NODES} more"
@@ -509,9 +513,9 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
             )
             yield fault("", message).within(config.file_of(DOMAINS_FILE, name))
     graphs: dict[tuple[str, int], dict[str, None]] = {}
-    for name, node in nodes:
+    for name, _, at, node in nodes:
         ros = config.domains[name].ros or node.ros
-        graphs.setdefault((node.cluster, ros.domain_id), {})[name] = None
+        graphs.setdefault((at, ros.domain_id), {})[name] = None
     for (cluster, number), names in sorted(graphs.items()):
         if len(names) > 1:
             listed = " and ".join(f"'{name}'" for name in names)

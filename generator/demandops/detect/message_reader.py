@@ -205,7 +205,9 @@ def _getter(path: str) -> Getter:
 
     def get(message: Any) -> Any:  # noqa: ANN401
         try:
-            return fetch(message)
+            value = fetch(message)
+            # a `byte` is a text of one byte to rclpy, and a number in a bag
+            return value[0] if isinstance(value, bytes) else value
         except (AttributeError, IndexError, TypeError):
             raise Unreadable(f"the message has no field {path}") from None
 

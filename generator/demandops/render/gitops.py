@@ -53,9 +53,9 @@ def bootstrap_path(cluster: str) -> str:
 def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
     """Return (cluster, access domain) for each domain with nodes in the cluster, sorted."""
     pairs = {
-        (node.cluster, domain.name)
+        (cluster, domain.name)
         for node in config.kinds_of_nodes()
-        for domain in config.domains_at(node)
+        for cluster, domain in config.places_of(node)
     }
     return [(cluster, config.domains[name]) for cluster, name in sorted(pairs)]
 
@@ -278,9 +278,7 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
     selectors: set[tuple[tuple[str, str], ...]] = set()
     by_pattern = list[str]()
     for node in config.kinds_of_nodes():
-        if node.selector is None or node.cluster != cluster:
-            continue
-        if domain not in config.domains_at(node):
+        if node.selector is None or (cluster, domain) not in config.places_of(node):
             continue
         if is_pattern(node.id):
             written = config.node_patterns[node.id].data["selector"].items()

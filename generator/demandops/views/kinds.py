@@ -584,9 +584,9 @@ def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     nodes: defaultdict[str, list[str]] = defaultdict(list)
     clusters: defaultdict[str, set[str]] = defaultdict(set)
     for node in sorted(source.config.kinds_of_nodes(), key=lambda node: node.id):
-        for domain in source.config.domains_at(node):
+        for cluster, domain in source.config.places_of(node):
             nodes[domain.name].append(node.id)
-            clusters[domain.name].add(node.cluster)
+            clusters[domain.name].add(cluster)
     for name, domain in sorted(source.config.domains.items()):
         item = {
             "name": name,
@@ -597,7 +597,7 @@ def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
             "rules": len(domain.rules),
             "quotas": domain.quotas.model_dump(by_alias=True, exclude_none=True),
             "clusters": sorted(clusters[name]),
-            "nodes": nodes[name],
+            "nodes": [*dict.fromkeys(nodes[name])],
             "file": source.config.file_of(DOMAINS_FILE, name),
         }
         yield name, (item,)

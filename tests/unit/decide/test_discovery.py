@@ -8,10 +8,14 @@ import pytest
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.decide.discovery import ClusterNode, discover
+from demandops.decide.state import State
+from demandops.decide.warnings import policy_warnings
 from demandops.model.config import discovered
 from demandops.model.config.discovered import DiscoveredNode
 from demandops.model.config.inventory import Cluster
 from demandops.model.config.load import load
+from demandops.model.ledger.ledger import Ledger
+from demandops.templating.evaluator import EVALUATE
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -134,3 +138,6 @@ def test_values_and_nodes_that_contradict_other_files_do_not_count() -> None:
     assert [config.nodes[id].properties for id in sizes] == [{"size": 3, "doors": 3}, {}, {}]
     assert "bus9" in config.nodes
     assert "bus9" not in config.domain_of, "two access domains match it"
+    told = "'bus9' is in the access domains 'b' by '*9' and 'perception' by 'bus*'; narrow these "
+    (warning,) = policy_warnings(State(config, Ledger(), EVALUATE))
+    assert str(warning).startswith(f"{POLICY}: {told}")

@@ -54,7 +54,7 @@ def message(x: object = 1, **more: Any) -> Message:
     point = Message(position=Message(x=x, y=2))
     pose = Message(position=Message(x=x, y=2), pose=point)
     state = Message(continuous_state=[x, 2])
-    return Message(pose=pose, state=state, engine=Message(heat=[20, 95]), **more)
+    return Message(pose=pose, state=state, engine=Message(heat=[20, b"\x5f"]), **more)
 
 
 @pytest.mark.parametrize("type_name", [name for name, p in POSITIONS.items() if not p.in_degrees])

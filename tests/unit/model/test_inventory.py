@@ -111,8 +111,8 @@ def test_any_id_is_one_node_or_none(id: str) -> None:
 
 
 def test_an_id_of_any_length_is_refused_as_what_it_is() -> None:
-    repo = MemoryRepo(inventory({"id": "vehicle{n}"} | VEHICLE))
-    for id in (f"vehicle{'9' * 5000}", "@" * 1000, "a@" * 5000):
+    repo = MemoryRepo(inventory({"id": "vehicle{n}_{a}{b}x"} | VEHICLE))
+    for id in (f"vehicle{'9' * 5000}", "@" * 1000, "a@" * 5000, f"vehicle{'_' * 1000}/x"):
         faults = repo.faults(put("d", id, id="fusion", topic=("/ego", id)))
         assert any("is not in inventory/nodes.yaml" in told for told in faults), faults
 

@@ -29,9 +29,9 @@ from demandops.cli.target import all_names, names_of
 from demandops.decide.booking import Drain
 from demandops.decide.placement import relocation
 from demandops.decide.state import State
+from demandops.model.config import discovered
 from demandops.model.config.base_model import document, matches, parse_file, parse_time, seconds_of
 from demandops.model.config.config import NODES_FILE
-from demandops.model.config.discovered import is_discovered
 from demandops.model.config.entry_patterns import may_match
 from demandops.model.config.inventory import NODE_LABEL
 from demandops.model.config.load import is_override_name
@@ -372,13 +372,14 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             )
             raise StateRepoError(message)
         path = config.file_of(NODES_FILE, host)
-        if is_discovered(path):
-            verb = "cordon" if drained else "uncordon"
-            way = shlex.join(["kubectl", verb, "-l", f"{NODE_LABEL}={host}"])
-            cluster = config.nodes[host].cluster
-            message = f"'{host}' is as cluster '{cluster}' has it; there, run: {way}"
-            raise StateRepoError(message)
         text = repo.file_reader()(path) or ""
+        if discovered.is_discovered(path):
+            cluster, verb = config.nodes[host].cluster, "cordon" if drained else "uncordon"
+            way = shlex.join(["kubectl", verb, "-l", f"{NODE_LABEL}={host}"])
+            message = f"'{host}' is as cluster '{cluster}' has it; there, run: {way}"
+            if any(node.gone_since for node in discovered.read(text, path) if node.id == host):
+                message = f"'{host}' is drained because cluster '{cluster}' has it no longer"
+            raise StateRepoError(message)
         try:
             changed = strict_yaml.set_flag(text, "nodes", host, "drained", drained)
         except InvalidInput as error:

@@ -253,7 +253,8 @@ def _node_faults(where: str, node: str, config: Config) -> Iterator[Fault]:
         )
         yield fault(where, f"{quoted(node)} {problem}", code="unknown-node")
     elif node and node not in config.domain_of:
-        problem = config.unlisted.why_not(node) or (
+        why = config.unlisted.why_not(node) or config.unlisted.of_several_domains(node)
+        problem = why or (
             "is not in any access domain; a platform engineer adds it to "
             f"{config.place_of(DOMAINS_FILE)}"
         )

@@ -12,7 +12,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from demandops.base import errors, naming, strict_yaml
 from demandops.base.errors import Fault, InvalidInput, Refused, fault, field_path, suggestion
-from demandops.base.placeholders import is_pattern
+from demandops.base.placeholders import glob_of, is_pattern
 from demandops.model.config import registry
 from demandops.model.config.appdef import (
     ApplicationDefinition,
@@ -189,11 +189,14 @@ class Config:
         for pattern in self.node_patterns.values():
             yield from (id for id in pattern.example_ids() if id in self.domain_of)
 
-    def domains_at(self, node: Node) -> list[AccessDomain]:
-        """Return the access domain of a node, or each that nodes of a pattern may be in."""
+    def places_of(self, node: Node) -> list[tuple[str, AccessDomain]]:
+        """Return a node's cluster and access domain, or each that nodes of a pattern may have."""
         if is_pattern(node.id):
-            return self.unlisted.possible_domains(node.id)
-        return [self.domain_of[node.id]] if node.id in self.domain_of else []
+            return [*self.unlisted.places(node.id, node.cluster, self.clusters)]
+        return [(node.cluster, self.domain_of[node.id])] if node.id in self.domain_of else []
+
+    def domains_at(self, node: Node) -> list[AccessDomain]:
+        return [*{domain.name: domain for _, domain in self.places_of(node)}.values()]
 
     def host_of(self, node: str) -> str:
         # `edge` for `edge@city`
@@ -333,19 +336,29 @@ class ConfigReader:
         for (file, place), (other, _) in ((first, second), (second, first)):
             self.add_fault(file, f"{place}{dot_key}", f"'{name}' is in {other} too; remove one")
 
-    def is_missing(self, collection: str, name: str) -> bool:
-        if collection in self.incomplete or name in self.places[collection]:
+    def is_missing(self, collection: str, name: str, of: str = "") -> bool:
+        """Return whether no entry has the name, which an entry with the id ``of`` may give."""
+        if collection in self.incomplete:
             return False  # an invalid item may be the missing one, and has faults of its own
-        return not any(pattern.values(name) for pattern in self.patterns[collection])
+        if is_pattern(name):  # what is no pattern itself names one
+            return not is_pattern(of) or not may_match(glob_of(name), self.places[collection])
+        return name not in self.places[collection] and not any(
+            pattern.values(name) for pattern in self.patterns[collection]
+        )
 
-    def check_reference(self, file: str, field: str, name: str, collection: str) -> None:
-        if self.is_missing(collection, name):
+    def check_reference(
+        self, file: str, field: str, name: str, collection: str, of: str = ""
+    ) -> None:
+        if self.is_missing(collection, name, of):
             where = place_of_collection(collection, self.files_of[collection])
             where = where.replace("inventory/", "")
             # thousands of names may be unknown, and only the first faults of a file are listed
             is_listed = self._counts[file] < errors.MOST_FAULTS
             hint = suggestion(name, self.places[collection]) if is_listed else ""
-            self.add_fault(file, field, f"'{name}' is not in {where}{hint}")
+            message = f"'{name}' is not in {where}{hint}"
+            if name in self.places[collection]:
+                message = f"'{name}' is a pattern; name one that it matches"
+            self.add_fault(file, field, message)
 
     def _valid(
         self,

@@ -40,9 +40,10 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
         if other != node.id:
             message = f"'{other}' has the folder {folder} too; choose another id"
             reader.add_fault(file, f"{place}.id", message)
-        reader.check_reference(file, f"{place}.cluster", node.cluster, configs.CLUSTERS_FILE)
-        for peer in node.bridged:
-            reader.check_reference(file, f"{place}.bridged.{peer}", peer, configs.NODES_FILE)
+        named = [("cluster", node.cluster, configs.CLUSTERS_FILE)]
+        named += [(f"bridged.{peer}", peer, configs.NODES_FILE) for peer in node.bridged]
+        for field, name, collection in named:
+            reader.check_reference(file, f"{place}.{field}", name, collection, node.id)
         for name, value in node.properties.items():
             kind, first = config.property_kinds[name]
             if kind_of(value) != kind and node.id not in config.hosts:  # once for each host
@@ -57,7 +58,7 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
     examples = (pattern.example for pattern in config.broker_patterns.values())
     for broker in (*config.brokers.values(), *examples):
         file, place = reader.places[configs.BROKERS_FILE][broker.node]
-        reader.check_reference(file, f"{place}.node", broker.node, configs.NODES_FILE)
+        reader.check_reference(file, f"{place}.node", broker.node, configs.NODES_FILE, broker.node)
 
 
 def _check_domains(config: Config, reader: ConfigReader) -> None:

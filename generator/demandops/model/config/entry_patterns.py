@@ -19,7 +19,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from demandops.base.errors import InvalidInput, fault, field_path
+from demandops.base.errors import InvalidInput, fault, field_path, suggestion
 from demandops.base.naming import MAX_ID
 from demandops.base.placeholders import (
     example_of,
@@ -49,21 +49,23 @@ _EXAMPLES = ("1", "a")
 
 
 class Globs(Generic[Value]):
-    """Patterns, each with a value, by the text before or after their wildcards."""
+    """Patterns, each with a value, by their first and by their longest text without wildcards."""
 
     def __init__(self, entries: Iterable[tuple[str, Value]]) -> None:
         self._by_start = defaultdict[str, list[tuple[str, Value]]](list)
-        self._by_end = defaultdict[str, list[tuple[str, Value]]](list)
-        for glob, value in entries:
-            start, *further = re.split("[*?]", glob)
-            end = further[-1] if further else ""
-            known = self._by_end[end] if len(end) > len(start) else self._by_start[start]
-            known.append((glob, value))
+        self._by_longest = defaultdict[str, list[tuple[str, Value]]](list)
+        for entry in entries:
+            fixed = re.split("[*?]", entry[0])
+            self._by_start[fixed[0]].append(entry)
+            self._by_longest[max(fixed, key=len)].append(entry)
         self._starts = sorted(self._by_start)
+        self._lengths = sorted({*map(len, self._by_longest)})
 
     def matching(self, id: str) -> Iterator[tuple[str, Value]]:
-        for cut in range(len(id) + 1):
-            for known in (self._by_start.get(id[:cut], ()), self._by_end.get(id[cut:], ())):
+        for length in self._lengths:
+            parts = (id[cut : cut + length] for cut in range(len(id) - length + 1))
+            for part in dict.fromkeys(parts):
+                known = self._by_longest.get(part, ())
                 yield from (each for each in known if matches(id, (each[0],)))
 
     def overlapping(self, glob: str) -> Iterator[tuple[str, Value]]:
@@ -71,8 +73,8 @@ class Globs(Generic[Value]):
         start, starts = re.split("[*?]", glob)[0], self._starts
         longer = starts[bisect_left(starts, start) : bisect_left(starts, f"{start}\U0010ffff")]
         shorter = (start[:cut] for cut in range(len(start)))
-        by_start = (self._by_start.get(key, ()) for key in (*shorter, *longer))
-        for known in (*by_start, *self._by_end.values()):
+        for key in (*shorter, *longer):
+            known = self._by_start.get(key, ())
             yield from (each for each in known if _overlap(glob, each[0]))
 
 
@@ -178,10 +180,25 @@ class EntryPattern(Generic[Entry]):
         errors = []
         for id in self.example_ids():
             try:
-                return self.entry(id).model_copy(update={self.key: self.id})
+                return self._with_names_as_written(self.entry(id))
             except InvalidInput as error:
                 errors.append(error)
         raise min(errors, key=lambda error: len(error.faults))  # some only concern a digit
+
+    def _with_names_as_written(self, entry: Entry) -> Entry:
+        # which cluster, node or domain a text with placeholders names, only a real id says
+        written: dict[str, Any] = {self.key: self.id}
+        if isinstance(entry, Node):
+            peers = zip(self.data.get("bridged", ()), entry.bridged.items(), strict=False)
+            further = zip(self.data.get("accessDomains", ()), entry.access_domains, strict=True)
+            written |= {
+                "cluster": self.data["cluster"],
+                "bridged": {at if is_pattern(at) else id: topics for at, (id, topics) in peers},
+                "access_domains": tuple(
+                    domain.model_copy(update={"name": at["name"]}) for at, domain in further
+                ),
+            }
+        return entry.model_copy(update=written)
 
 
 def _read_number(
@@ -196,10 +213,20 @@ def _read_number(
 
 
 class EntryPatterns(Generic[Entry]):
-    """The patterns of one kind of entry; ``find`` gives an id's entry, or why it has none."""
+    """The patterns of one kind of entry; ``find`` gives an id's entry, or why it has none.
 
-    def __init__(self, word: str, patterns: Iterable[EntryPattern[Entry]] = ()) -> None:
+    The field ``refers`` of an entry names one of ``known``.
+    """
+
+    def __init__(
+        self,
+        word: str,
+        patterns: Iterable[EntryPattern[Entry]] = (),
+        refers: str = "",
+        known: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
         self._word, self._patterns = word, tuple(patterns)
+        self._refers, self._known = refers, known
         self._globs = Globs((pattern.glob, pattern) for pattern in self._patterns)
         self.find = lru_cache(maxsize=65_536)(self._find)
 
@@ -221,11 +248,20 @@ class EntryPatterns(Generic[Entry]):
             return None, f"matches {named}; narrow one of these patterns"
         if not patterns:
             return None, ""
+        (pattern,) = patterns
         try:
-            return patterns[0].entry(id), ""
+            entry = pattern.entry(id)
+            if (name := getattr(entry, self._refers)) not in self._known:
+                field, hint = (
+                    field_path((*pattern.place, self._refers)),
+                    suggestion(name, self._known),
+                )
+                message = f"there is no {self._refers} {quoted(name)}{hint}"
+                raise InvalidInput.at(field, message, file=pattern.file)
+            return entry, ""
         except InvalidInput as error:
-            pattern = quoted(patterns[0].id)
-            return None, f"is no {self._word} of the pattern {pattern}: {error.faults[0]}"
+            named = quoted(pattern.id)
+            return None, f"is no {self._word} of the pattern {named}: {error.faults[0]}"
 
 
 # ---- what the patterns of an inventory give for an id that nobody listed ----
@@ -299,15 +335,31 @@ class UnlistedNodes:
         names = {name for _, name in self._globs.overlapping(glob_of(pattern))}
         return [self._domains[name] for name in sorted(names)]
 
+    def places(
+        self, pattern: str, text: str, names: Iterable[str]
+    ) -> Iterator[tuple[str, AccessDomain]]:
+        """Yield each of ``names`` that ``text`` may name, with each domain of those nodes."""
+        for name in names if is_pattern(text) else (text,):
+            if (values := values_in(text, name)) is not None:
+                for domain in self.possible_domains(filled(pattern, values)):
+                    yield name, domain
+
     def _made(self, id: str) -> tuple[Node | None, AccessDomain | None, str]:
         node, problem = self.patterns.find(id)
         if node is None:
             return None, None, problem
+        if problem := self.of_several_domains(id):
+            return node, None, problem
+        name = next((name for _, name in self._globs.matching(id)), None)
+        return node, self._domains[name] if name is not None else None, ""
+
+    def of_several_domains(self, id: str) -> str:
+        """Return which access domains match an id, if these are several; then it is in none."""
         by_name = {name: glob for glob, name in self._globs.matching(id)}
-        if len(by_name) > 1:
-            named = " and ".join(f"'{name}' by {quoted(by_name[name])}" for name in sorted(by_name))
-            return node, None, f"is in the access domains {named}; narrow these patterns"
-        return node, self._domains[min(by_name)] if by_name else None, ""
+        if len(by_name) < 2:
+            return ""
+        named = " and ".join(f"'{name}' by {quoted(by_name[name])}" for name in sorted(by_name))
+        return f"is in the access domains {named}; narrow these patterns"
 
 
 NO_BROKER_PATTERNS = EntryPatterns[Any]("broker")

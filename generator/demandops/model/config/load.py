@@ -11,8 +11,9 @@ from collections.abc import Mapping
 from itertools import chain
 from pathlib import PurePosixPath
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from demandops.base.placeholders import filled, values_in
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION, RENDER_VERSION
 from demandops.model.config import config as configs
@@ -87,7 +88,7 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         capacity = settings.with_short_names(node.capacity) if node.capacity else node.capacity
         return node.model_copy(update={"capacity": capacity})
 
-    node_patterns = EntryPatterns("node", reader.patterns[configs.NODES_FILE])
+    node_patterns = EntryPatterns("node", reader.patterns[configs.NODES_FILE], "cluster", clusters)
     unlisted = UnlistedNodes(node_patterns, domains, completed)
     clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of[configs.CLIENTS_FILE]:
@@ -102,8 +103,24 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
     for pattern in node_patterns:
         node = pattern.example
-        for domain in unlisted.possible_domains(pattern.id):
-            _in_further_domains(reader, {node.id: node}, domains, {node.id: domain})
+        # the values of placeholders that clusters and domains have; others give no node
+        asked: list[tuple[str, Mapping[str, Any]]] = [(node.cluster, clusters)]
+        asked += [(at.name, domains) for at in node.access_domains]
+        possible = list[dict[str, str]]([{}])
+        for text, names in asked if node.access_domains else ():
+            found = (
+                (known, values_in(filled(text, known), each))
+                for known in possible
+                for each in names
+            )
+            possible = [known | more for known, more in found if more is not None] or possible
+        for known in possible:
+            further = [
+                at.model_copy(update={"name": filled(at.name, known)}) for at in node.access_domains
+            ]
+            one = node.model_copy(update={"access_domains": further})
+            for domain in unlisted.possible_domains(filled(pattern.id, known)):
+                _in_further_domains(reader, {node.id: one}, domains, {node.id: domain})
     all_nodes = {id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()}
     if node_patterns:
         all_nodes = OnDemand(all_nodes, lambda id: (made := unlisted.find(id)) and made.node)
@@ -116,7 +133,9 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     brokers = reader.read_items(
         configs.BROKERS_FILE, inventory.BrokersFile, "brokers", inventory.Broker, "node"
     )
-    broker_patterns = EntryPatterns("broker", reader.patterns[configs.BROKERS_FILE])
+    broker_patterns = EntryPatterns(
+        "broker", reader.patterns[configs.BROKERS_FILE], "node", all_nodes
+    )
     if broker_patterns:
         brokers = OnDemand(brokers, lambda node: broker_patterns.find(node)[0])
     charts = reader.read_items(configs.CHARTS_FILE, registry.ChartsFile, "charts", registry.Chart)
@@ -288,7 +307,9 @@ def _in_further_domains(
         for index, further in enumerate(node.access_domains):
             where, id = f"{place}.accessDomains[{index}]", id_in_domain(node.id, further.name)
             domain = domains.get(further.name)
-            reader.check_reference(file, f"{where}.name", further.name, configs.DOMAINS_FILE)
+            reader.check_reference(
+                file, f"{where}.name", further.name, configs.DOMAINS_FILE, node.id
+            )
             if first is None:
                 # the node may be in an invalid domain, or in several, which has a fault of its own
                 is_matched = any(matches(node.id, d.nodes) for d in domains.values())
