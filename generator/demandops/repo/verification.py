@@ -161,10 +161,6 @@ class Verdict:
     signature: str = ""
 
 
-class _Unreadable(Exception):
-    """Raised when a commit cannot be verified because one of its files is not valid."""
-
-
 class _Proof:
     # the files that a commit should have, rendered again to compare with its committed files
     def __init__(self, snapshot: Snapshot, commit: Commit) -> None:
@@ -260,13 +256,19 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
             verdict = replace(verdict, touched=tuple(sorted(disallowed_files(repo, commit, entry))))
             if whole or place == len(commits):
                 before = None
-            snapshot = _loaded(repo, commit, entry, before.snapshot if before else None)
-            is_next = before is not None and before.advanced(snapshot, commit)
-            proof = before if before and is_next else _Proof(snapshot, commit)
-            differing = proof.differing()
-        except _Unreadable as error:
-            why = f"a file was not valid at this commit: {error}"
-            yield replace(verdict, skipped=why, holds=verdict.holds and not verdict.touched)
+            known = before.snapshot if before else None
+            try:
+                snapshot = snapshots.load(repo, commit.id, entry=entry, before=known)
+                invalid = snapshot.claim_faults
+            except InvalidInput as error:
+                invalid = error.faults
+            if invalid:
+                why = f"a file was not valid at this commit: {invalid[0]}"
+                yield replace(verdict, skipped=why, holds=verdict.holds and not verdict.touched)
+                continue
+            if before is None or not before.advanced(snapshot, commit):
+                before = _Proof(snapshot, commit)
+            proof, differing = before, before.differing()
         except InvalidInput as error:  # the generator could render the commit, so this is a fault
             yield replace(verdict, holds=False, fault=str(error.faults[0]))
         except StateRepoError as error:
@@ -274,18 +276,6 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         else:
             holds = verdict.holds and not (differing or verdict.touched)
             yield replace(verdict, holds=holds, differing=differing)
-
-
-def _loaded(
-    repo: Repository, commit: Commit, entry: LogEntry, before: Snapshot | None = None
-) -> Snapshot:
-    try:
-        snapshot = snapshots.load(repo, commit.id, entry=entry, before=before)
-    except InvalidInput as error:
-        raise _Unreadable(error.faults[0]) from None
-    if snapshot.claim_faults:
-        raise _Unreadable(snapshot.claim_faults[0])
-    return snapshot
 
 
 def _blob(text: str) -> Oid:

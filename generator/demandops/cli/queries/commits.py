@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime
 from itertools import islice
-from typing import Any
+from typing import Any, get_args
 
 import click
 
@@ -25,6 +25,7 @@ from demandops.cli.target import name_options, state_repo_option
 from demandops.decide.bookkeeping import EntryChange, as_data, bookkeeping_changes
 from demandops.decide.bookkeeping import bookkeeping as derive
 from demandops.decide.state import MergePreview, ReleaseChange, planned_releases, preview
+from demandops.model.demand.demand import Operation
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
 from demandops.repo.history import commit_log
@@ -182,8 +183,8 @@ def entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
 
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
-    *("join", "shutdown", "put", "release", "renew", "expire", "wait", "decommission", "drain"),
-    *("follow", "discover", "expire-override", "rollback", "reject", "upgrade", "init", "by-hand"),
+    *get_args(Operation),
+    *("follow", "discover", "expire-override", "reject", "upgrade", "init", "by-hand"),
 )
 
 # The filters by what the trailers of a commit name.
