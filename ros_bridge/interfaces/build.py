@@ -33,7 +33,7 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from graphlib import CycleError, TopologicalSorter
@@ -181,13 +181,12 @@ def find_packages(given: Iterable[str]) -> dict[str, Package]:
             folders[path.name] = path
     chosen: dict[str, Path] = {}
     for text in given:
-        below = Path(text).resolve().rglob("msg")
-        inside = sorted(path.parent for path in below if any(path.glob("**/*.msg")))
+        inside = sorted(_with_messages(Path(text).resolve()))
         if not inside:
             raise Refused(f"{text}: has no file msg/*.msg; name the folder of an interface package")
         for folder in inside:
             name = _name_of(folder)
-            if chosen.setdefault(name, folder) != folder:
+            if not folder.samefile(chosen.setdefault(name, folder)):
                 raise Refused(f"{folder}: is named {name}, like {chosen[name]}; give one of them")
     folders |= chosen
     found = _read_packages(folders)
@@ -213,6 +212,19 @@ def find_packages(given: Iterable[str]) -> dict[str, Package]:
             digest.update(f"{place} {len(content)}\n".encode() + content)
         packages[name] = replace(found[name], digest=digest.hexdigest())
     return packages
+
+
+def _with_messages(top: Path) -> Iterator[Path]:
+    seen = set[str]()
+    # a workspace has links to packages; each folder counts once, so that links may form a circle
+    for folder, below, _ in os.walk(top, followlinks=True):
+        below.sort()
+        if (place := os.path.realpath(folder)) in seen:
+            below.clear()
+        elif "msg" in below and any(Path(folder, "msg").glob("**/*.msg")):
+            below.remove("msg")
+            yield Path(folder)
+        seen.add(place)
 
 
 def _read_packages(folders: dict[str, Path]) -> dict[str, Package]:

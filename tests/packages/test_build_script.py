@@ -125,8 +125,10 @@ def test_folders_of_messages_are_built_after_what_they_need_and_kept(
     built = [line.split()[1] for line in capsys.readouterr().out.splitlines()[-8:]]
     assert built == ["fleet_msgs:"] * 4 + ["hazard_msgs:"] * 4
     (given / "fleet_msgs" / "msg" / "Motion.msg").write_text("float64[] state\n")
-    (given / "again").symlink_to("fleet_msgs")
-    for folders, made in (((), 0), (("fleet_msgs", "fleet_msgs", "again"), 2), ((), 0)):
+    (given / "src").mkdir()
+    for name, to in {"fleet_msgs": given / "fleet_msgs", "again": given}.items():
+        (given / "src" / name).symlink_to(to)
+    for folders, made in (((), 0), (("fleet_msgs", "fleet_msgs", "src"), 2), ((), 0)):
         assert script.main(*(str(given / name) for name in folders)) == 0
         assert calls(script) == ["configure", *MADE] * made
     (given / "fleet_msgs" / "msg" / "Lost.msg").symlink_to("nowhere")
