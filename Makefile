@@ -166,7 +166,7 @@ fuzz: export FUZZ_S ?= 10
 fuzz: system-test setup  ## Try odd inputs on every parser and writer, each for FUZZ_S seconds (default 10)
 	@$(PY) -m tests.fuzz
 
-simulate: setup  ## Find 65 planted faults, then simulate generators, people and faults for SIMULATE_S=60 seconds from SEED
+simulate: setup  ## Find 68 planted faults, then simulate generators, people and faults for SIMULATE_S=60 seconds from SEED
 	@$(PY) -m pytest -q -n auto $(SIMULATION_TESTS)
 	@$(PY) -m tests.simulation.run
 

@@ -17,7 +17,7 @@ def page() -> str:
         _paragraphs(cli.help or ""),
         _options(cli, group),
     ]
-    for name in sorted(COMMANDS):
+    for name in COMMANDS:
         command = load(name)
         context = click.Context(command, parent=group, info_name=name)
         usage = " ".join([context.command_path, *command.collect_usage_pieces(context)])

@@ -33,7 +33,7 @@ from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.load import snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.proposal_branch import ProposalBranches
-from demandops.serve import agenda, journal
+from demandops.serve import agenda, journal, node_discovery
 from demandops.serve.agenda import Agenda
 from demandops.serve.approvals import Approvals
 from demandops.serve.demands import Demands
@@ -214,6 +214,15 @@ FAULTS: dict[str, Fault] = {
     "count_no_room": Fault(7, forbidden, "excesses", lambda *_: []),
     "count_released_room_as_taken": Fault(0, Usage, "plus",
         lambda plus, usage, more: plus(usage, {need: n for need, n in more.items() if n > 0})),
+
+    # ---- nodes of clusters ----
+    "see_no_cordon": Fault(4, node_discovery, "discover",
+        lambda discover, cluster, seen, *more:
+            discover(cluster, [one._replace(is_cordoned=False) for one in seen], *more)),
+    "let_nodes_go_only_with_other_news": Fault(1, node_discovery, "discover",
+        lambda discover, *given: discover(*given)._replace(has_gone=False)),
+    "take_out_nodes_that_claims_need": Fault(15, node_discovery, "discover",
+        lambda discover, *given: discover(*given[:-1], lambda id: False)),
 
     # ---- overrides ----
     "apply_no_override_to_what_a_demand_changes": Fault(29, decision, "plan_change",

@@ -12,6 +12,7 @@ from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any
 
 import pygit2
+from demandops.model.config.discovered import DISCOVERED_ROOT
 from demandops.repo.git.repository import MAIN
 from demandops.serve.agenda import LONGEST_WAIT_S
 
@@ -24,7 +25,7 @@ from tests.model.listed import Goal
 from tests.model.running import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY, Running
 from tests.model.view import key_in_ledger
 from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
-from tests.simulation.world import World
+from tests.simulation.world import MACHINE, RACK, World
 
 STEPS = 30
 STATE_REPO = Path(__file__).with_name("state-repo")
@@ -75,7 +76,7 @@ class History:
             [
                 (self._tallied, self._delete_claim),
                 (self._tallied, self._move_channel),
-                (self._placed, self._drain),
+                *[(self._placed, self._drain)] * 2,
                 (self._visitor, self._edit_generated),
                 (self._any, self._delete_claim),
                 (self._any, self._override),
@@ -107,6 +108,7 @@ class History:
             machine.crashes_in = machine.losses = machine.rejections = 0
             if not machine.is_up:
                 machine.start()
+        self.world.tell_nodes()
         self.turns.sleep(2 * LONGEST_WAIT_S)
         self.world.set_clocks(self._latest - self.turns.offset)
         self.turns.sleep(60)
@@ -267,6 +269,7 @@ class History:
             machine.delay = self.chance.choice([0.02, 0.5, 5])
         else:
             machine.is_cut_off, machine.delay = False, 0.0
+            self.world.tell_nodes()
 
     def set_clocks(self) -> None:
         """Set the wall clocks forward or back; after the first step back, only further back.
@@ -323,6 +326,9 @@ class History:
         books = self.oracle.books
         used = sorted(PLACES - books.free() - books.drained) if self.chance.randrange(3) else []
         name = self.chance.choice(used or sorted(PLACES))
+        if name == RACK:
+            self._change_cluster()
+            return
         drained = name not in books.drained
 
         def drain(data: Any) -> None:
@@ -330,6 +336,15 @@ class History:
             node["drained"] = drained
 
         self._change(NODES, drain, lambda books: books.drain(name, drained))
+
+    def _change_cluster(self) -> None:
+        """Cordon or uncordon the machine, take it out of the cluster, or bring it back."""
+        machine = self.world.nodes.pop(RACK, None)
+        if machine is None:
+            self.world.nodes[RACK] = MACHINE
+        elif self.chance.randrange(3):
+            self.world.nodes[RACK] = machine._replace(is_cordoned=not machine.is_cordoned)
+        self.world.tell_nodes()
 
     def _stop_waiting(self) -> None:
         self.oracle.check()
@@ -356,7 +371,8 @@ class History:
             self._commit({path: None}, lambda books: books.drop([gone]))
 
     def _edit_generated(self) -> None:
-        path = self.chance.choice(sorted(self.repo.manifests()))
+        discovered = self.repo.files(DISCOVERED_ROOT)
+        path = self.chance.choice(sorted({*self.repo.manifests(), *discovered}))
         self._commit({path: self.chance.choice([None, "hand: made\n"])})
 
     def _branches(self) -> list[str]:

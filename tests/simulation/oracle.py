@@ -13,6 +13,7 @@ from typing import Any
 
 import pygit2
 from demandops.base.errors import InvalidInput, ShuttingDown, TurnedDown, Withdrawn
+from demandops.model.config.discovered import DISCOVERED_ROOT
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import Claim
 from demandops.repo import verification
@@ -27,10 +28,10 @@ from tests.model import books, view
 from tests.model.goals import SKELETON
 from tests.model.listed import Goal, Subject
 from tests.model.running import FURTHER, NEXT, Link, Override, Running, Service
-from tests.simulation.world import Machine, World
+from tests.simulation.world import RACK, Machine, World
 
 SLACK_S = 30
-PLACES = frozenset({"rack0", "rack1"})
+PLACES = frozenset({"rack0", RACK})
 """The nodes for demands that name no node; each of these nodes has room for one application."""
 VISITOR = "visitor"
 """A requester whose id starts with this needs approval for its demands."""
@@ -82,7 +83,8 @@ class Oracle:
         self.decided: set[str] = set()
         self.counts = Counter[str]()
         self._seen = world.tip
-        self.books = Running(SKELETON, nodes=PLACES)
+        # until a generator has seen the cluster, nothing can be placed on its node
+        self.books = Running(SKELETON, nodes=PLACES, drained=frozenset({RACK}))
         self._ended: set[Override] = set()
         self._pushed_at = world.turns.monotonic()
         """When the oracle last found a new tip of main."""
@@ -156,6 +158,9 @@ class Oracle:
         }
         self.edits.get(str(commit.id), lambda books: None)(self.books)
         self._follow_overrides(commit)
+        if entry_of(commit).by_generator:
+            node = _discovered(commit)
+            self.books.drain(RACK, not node or "goneSince" in node or node.get("drained", False))
         for operation, branch in self._operations(commit):
             assert operation not in self._place, f"{operation} is booked twice"
             self._place[operation], self._commit[operation] = len(self._models), str(commit.id)
@@ -393,6 +398,13 @@ class Oracle:
         on = {node for what, _ in self._claims.values() if (node := what.get("node"))}
         assert not free or not self.books.waiting, f"{self.books.waiting} wait, {free} are free"
         assert not free or not on & drained, f"{on & drained} were not emptied, {free} are free"
+        node = _discovered(self.world.remote.get(tip))
+        there = self.world.nodes.get(RACK)
+        if there is None:
+            assert not node or ("goneSince" in node and RACK in on), "a node stays that is gone"
+        else:
+            seen = node.get("drained", False), "goneSince" in node
+            assert node and seen == (there.is_cordoned, False), f"{node}, but it is {there}"
         late = [one.name for one in self.books.overrides if one.end]
         assert not late, f"did not end: {late}"
         (verdict,) = verification.verify(self.world.remote, [tip])
@@ -401,6 +413,13 @@ class Oracle:
 
 def _assert_same(commit: pygit2.Commit, found: object, expected: object) -> None:
     assert found == expected, f"after {commit.message}\n{found}\nbut expected\n{expected}"
+
+
+def _discovered(commit: Any) -> dict[str, Any]:
+    """Return the entry of the node that the cluster has, or nothing."""
+    (*texts,) = trees.texts(commit.tree, [DISCOVERED_ROOT]).values()
+    nodes = [node for text in texts for node in plain_yaml.load(text)["nodes"]]
+    return next(iter(nodes), {})
 
 
 def _overrides(commit: pygit2.Commit) -> tuple[list[Override], set[str]]:

@@ -19,6 +19,8 @@ from typing import Any
 import pygit2
 from demandops.base.errors import DemandOpsError, StateRepoError
 from demandops.base.runtime import Runtime
+from demandops.decide.discovery import ClusterNode
+from demandops.model.config.inventory import NODE_LABEL
 from demandops.repo.git.remote_repository import GitResult, RemoteRepository
 from demandops.repo.git.repository import MAIN, FetchInterrupted
 from demandops.serve import generator
@@ -28,6 +30,10 @@ from greenlet import getcurrent
 from tests.kit.clock import Turns
 
 FETCH_INTERVAL_S = 30.0
+RACK = "rack1"
+"""The node that nobody lists, because the cluster has it."""
+_LABELS = {NODE_LABEL: RACK, "demandops/type": "rack"}
+MACHINE = ClusterNode("machine-7", _LABELS, {"slots": "1"}, is_cordoned=False, writers={})
 _JOURNAL = "outbox.jsonl"
 
 
@@ -47,6 +53,7 @@ class Machine(Runtime):
         self.crashes_in = self.losses = self.rejections = 0
         self.is_cut_off, self.delay = False, 0.0
         self.has_rejected = False
+        self.nodes_read: dict[str, list[ClusterNode]] = {}
 
     def processor_s(self) -> float:
         return 0.0
@@ -70,8 +77,15 @@ class Machine(Runtime):
             except StateRepoError as error:
                 assert "cannot be fetched" in str(error), error
                 self.sleep(5)
+        self.nodes_read = {}
+        made.take_over_nodes(lambda config: self._read_nodes())
         self.generator, self.started_at = made, self.monotonic()
         self.world.on_start(self)
+
+    def _read_nodes(self) -> dict[str, list[ClusterNode]]:
+        if not self.is_cut_off:
+            self.nodes_read = {"c-its": [*self.world.nodes.values()]}
+        return self.nodes_read
 
     def failed(self, name: str, error: Exception) -> None:
         super().failed(name, error)
@@ -275,6 +289,8 @@ class World:
         self.machines = [Machine(self, f"machine{number}") for number in range(machines)]
         self.last_jump = -1.0
         """When the clocks were last set forward."""
+        self.nodes = {RACK: MACHINE}
+        """The nodes that the cluster has, by id."""
 
     @property
     def tip(self) -> str:
@@ -306,6 +322,11 @@ class World:
             for machine in self.machines:
                 self.dead += machine.threads
             self.turns.end(self.dead)
+
+    def tell_nodes(self) -> None:
+        for machine in self.machines:
+            if machine.generator and not machine.is_cut_off:
+                machine.generator.nodes_changed()
 
     def set_clocks(self, seconds: float) -> None:
         self.turns.set_by(seconds)

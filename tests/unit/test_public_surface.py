@@ -109,7 +109,7 @@ def environment() -> list[str]:
 
 SECTIONS: dict[str, Callable[[], object]] = {
     "options": lambda: [parameter(each) for each in main.cli.params],
-    "commands": lambda: {name: command_of(main.load(name)) for name in sorted(main.COMMANDS)},
+    "commands": lambda: {name: command_of(main.load(name)) for name in main.COMMANDS},
     "exit codes": lambda: {each.name: each.value for each in main.ExitCode},
     "environment": environment,
     "client": lambda: {

@@ -8,14 +8,12 @@ from __future__ import annotations
 import errno
 import logging
 import os
-import re
 import shutil
 import signal
 import sys
 from contextlib import suppress
 from enum import IntEnum
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
@@ -27,28 +25,63 @@ from demandops.base.quoting import OneLineFormatter, one_line
 from demandops.cli.output import OutputLost, done, errors, open_streams, show_slow
 from demandops.repo.git import child_processes
 
-# The module of each command, which is below `demandops.cli`, except in `demandops_ros`.
+# The short help of each command, which `--help` shows without importing its module.
 COMMANDS = {
-    name: module if module.startswith("demandops_ros.") else f"demandops.cli.{module}"
-    for module, names in {
-        "authoring.check": "check",
-        "authoring.new": "new",
-        "authoring.schema": "schema",
-        "changes.configure": "drain override resume revert suspend undrain",
-        "changes.demand": "demand",
-        "changes.ledger_change": "decommission release rollback",
-        "changes.person_change": "approve reject",
-        "demandops_ros.detector.detect_command": "detect",
-        "demandops_ros.parameter_sync": "parameter-sync",
-        "demandops_ros.serve_command": "serve",
-        "program": "completion config version",
-        "queries.commits": "bookkeeping diff log",
-        "queries.get": "get",
-        "queries.status": "reconcile status watch web",
-        "queries.why": "may why",
-        "state_repo": "init journal upgrade verify",
-    }.items()
-    for name in names.split()
+    "approve": "Approve a proposal: merge its branch in your own name.",
+    "bookkeeping": "Show who requests which service and connection.",
+    "check": "Check edits of a state repo and show their consequences.",
+    "completion": "Print the completion script for a shell.",
+    "config": "List, set and choose contexts: the fleets that you work with.",
+    "decommission": "Release all claims of a node or a requester.",
+    "demand": "Demand what files ask for: book it, or send it to a node.",
+    "detect": "Watch topics, and send the demands that rules ask for.",
+    "diff": "Show the differences between two commits.",
+    "drain": "Take a node out of use: the generator places nothing there.",
+    "get": "List demands, releases, nodes, overrides and so on.",
+    "init": "Create a state repo.",
+    "journal": "List the accepted demands that are not published.",
+    "log": "List the commits of the state repo, newest first.",
+    "may": "Say whether a requester may demand an application, and why.",
+    "new": "Write a new application or image.",
+    "override": "Create and end overrides: deviations that people declare.",
+    "parameter-sync": "Keep a ROS node's parameters equal to those in a ConfigMap.",
+    "release": "Stop one demand, or an application for all who demand it.",
+    "reconcile": "Let Flux or Argo CD fetch now, and not at its next interval.",
+    "reject": "Reject a proposal: delete its branch, and record who and why.",
+    "resume": "Run suspended applications and connections again.",
+    "revert": "Undo a person's commit, by a new commit.",
+    "rollback": "Restore the claims of an earlier commit, by a new commit.",
+    "schema": "Print the JSON Schema of a kind of file.",
+    "serve": "Run the ROS 2 node that accepts demands.",
+    "status": "Show the state of each release on its cluster.",
+    "suspend": "Stop applications and connections; their claims stay booked.",
+    "undrain": "Use a drained node again.",
+    "upgrade": "Render everything again, in one commit.",
+    "verify": "Render commits again from their ledger and compare the bytes.",
+    "version": "Print the versions of the program and of its formats.",
+    "watch": "Show releases, demands and the latest commits live.",
+    "web": "Show the state repo on a web page.",
+    "why": "Explain why something runs or ran, and who decided it.",
+}
+
+# The commands of each module, which is below `demandops.cli`, except in `demandops_ros`.
+MODULES = {
+    "authoring.check": "check",
+    "authoring.new": "new",
+    "authoring.schema": "schema",
+    "changes.configure": "drain override resume revert suspend undrain",
+    "changes.demand": "demand",
+    "changes.ledger_change": "decommission release rollback",
+    "changes.person_change": "approve reject",
+    "demandops_ros.detector.detect_command": "detect",
+    "demandops_ros.parameter_sync": "parameter-sync",
+    "demandops_ros.serve_command": "serve",
+    "program": "completion config version",
+    "queries.commits": "bookkeeping diff log",
+    "queries.get": "get",
+    "queries.status": "reconcile status watch web",
+    "queries.why": "may why",
+    "state_repo": "init journal upgrade verify",
 }
 
 # Other names of commands.
@@ -108,17 +141,11 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    command: click.Command = getattr(imported(name, COMMANDS[name]), name.replace("-", "_"))
+    module = next(module for module, names in MODULES.items() if name in names.split())
+    ros = module.startswith("demandops_ros.")
+    found = imported(name, module if ros else f"demandops.cli.{module}")
+    command: click.Command = getattr(found, name.replace("-", "_"))
     return command
-
-
-def short_help(name: str) -> str:
-    # the first line of the function's docstring, without an import of its module, which is slow
-    spec = find_spec(COMMANDS[name])
-    text = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
-    function = rf'^def {name.replace("-", "_")}\(.*?^    """(.*?)$'
-    found = re.search(function, text, re.MULTILINE | re.DOTALL)
-    return found[1] if found else ""
 
 
 def imported(name: str, module: str) -> ModuleType:
@@ -144,12 +171,6 @@ def imported(name: str, module: str) -> ModuleType:
 
 class _LazyGroup(click.Group):
     """A group that lists its commands from ``COMMANDS`` and imports only the command to run."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return sorted(COMMANDS)
-
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        return click.Command(name, short_help=short_help(name)) if name in COMMANDS else None
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -181,6 +202,7 @@ class _LazyGroup(click.Group):
 
 @click.group(
     cls=_LazyGroup,
+    commands=[click.Command(name, short_help=text) for name, text in COMMANDS.items()],
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.version_option(__version__, prog_name="demandops")

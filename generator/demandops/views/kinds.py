@@ -845,7 +845,7 @@ KINDS: dict[str, Kind] = {
             (
                 *(Column("subject", "Subject", texts_of=_subject, links="held"), STATE, REQUESTERS),
                 *(Column("demand", "Demand", 3, links="demand"), LEASE, SINCE),
-                Column("suspended_by", "Suspended by", 1, texts_of=_suspending, links="override"),
+                Column("suspended_by", "Suspended by", 4, texts_of=_suspending, links="override"),
                 *(_wide("request", "Request"), _wide("file", "File")),
             ),
             _claims,

@@ -52,7 +52,8 @@ def new() -> None:
 
     \b
     Examples:
-      demandops new image cam --repository ghcr.io/me/cam --state-repo git@host:f
+      demandops new application tracking --input camera=sensor_msgs/msg/Image \\
+        --service detector=my_package/detector --image ghcr.io/me/tracking:1.0
     """
 
 
@@ -236,7 +237,8 @@ def application(  # noqa: PLR0913 - as many as options
 
     \b
     Examples:
-      demandops new application x --input a=b/msg/C --service s=p/f --image r/i:1
+      demandops new application tracking --input camera=sensor_msgs/msg/Image \\
+        --service detector=my_package/detector --image ghcr.io/me/tracking:1.0
     """
     with busy("reading the state repo"):
         with edited_checkout.opened(directory) as (_, tree):
