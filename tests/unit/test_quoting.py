@@ -76,7 +76,7 @@ def test_a_log_record_is_one_line_and_its_trace_is_indented(caplog: Any) -> None
 
 
 def test_commands_print_no_text_that_controls_a_terminal(capsys: Any) -> None:
-    table = Table([Column("", "Summary")], [[HOSTILE[:90]], [[HOSTILE[:90]]]])
+    table = Table([Column("", "Summary")], [[[HOSTILE[:90]]]] * 2)
     show("text", None, [HOSTILE[:90], table])
     output.errors.print(HOSTILE[:90])
     print_json({"summary": HOSTILE[:90]})
@@ -114,7 +114,7 @@ def test_an_empty_table_says_so() -> None:
 def test_no_word_is_ever_cut(rows: list[tuple[str, str, list[str]]], width: int) -> None:
     """The first column is always shown whole. Another column is left out if it does not fit."""
     columns = (Column("", "Name"), Column("", "State", 1), Column("", "Since", 2))
-    table = Table(columns, rows)
+    table = Table(columns, [([name], [state], since) for name, state, since in rows])
     shown = table.lines(width)
     told = " ".join(shown).split()
     assert [word for row in rows for word in row[0].split() if word not in told] == []

@@ -313,12 +313,12 @@ def show(replay: Replay, output: str) -> None:
     columns = [Column(key, key.capitalize(), rank) for key, rank in ranks.items()]
     rows = [
         (
-            f"{event.at - replay.span[0]:.1f}",
-            "start" if event.starts else "stop",
-            event.rule,
-            ", ".join(event.subjects),
-            event.why,
-            "" if goal is None else goal.id,
+            [f"{event.at - replay.span[0]:.1f}"],
+            ["start" if event.starts else "stop"],
+            [event.rule],
+            event.subjects,
+            [event.why],
+            [] if goal is None else [goal.id],
         )
         for event, goal in replay.events
     ]

@@ -20,7 +20,7 @@ from tests.kit import plain_yaml, rig
 from tests.kit.clock import Clock
 from tests.kit.goals import put
 from tests.kit.memory import NOW
-from tests.kit.repo import GitRepo, Person, assert_sound, commits, git, read
+from tests.kit.repo import GitRepo, Person, assert_sound, commits, git, read, tip
 
 FILE = "inventory/discovered/c-its.yaml"
 CLUSTERS = "inventory/clusters.yaml"
@@ -69,7 +69,11 @@ class Cluster:
         assert rig.outcome(self.generator.submit(put("none", node="nowhere"))) == "unknown-node"
 
     def look(self) -> None:
-        """Have the generator look at the nodes, a minute after the last time."""
+        """Have the generator look at the nodes, a minute after the last time, as main is now."""
+        self.generator.fetch_now()
+        rig.wait_until(
+            lambda: str(self.generator.snapshot.commit) == str(tip(self._bare)), "it is at main"
+        )
         self.change(node_discovery._PAUSE_S + node_discovery._GATHER_S)
 
     @property
@@ -146,7 +150,6 @@ def test_a_node_moves_to_another_cluster_when_it_has_left_the_first(
     cluster: Cluster, bare: Path, person: Person, clock: Clock
 ) -> None:
     person.change({CLUSTERS: f"{FROM_CLUSTER}  - {{name: other, nodes: from-cluster}}\n"})
-    cluster.generator.fetch_now()
     cluster.add("bus0")
     cluster.of_other |= cluster.nodes  # both are new, but only one can be the node
     cluster.look()
@@ -229,7 +232,6 @@ def test_a_cluster_whose_nodes_are_listed_again_leaves_no_file(
     cluster.add("bus0")
     cluster.look()
     person.edit(CLUSTERS, FROM_CLUSTER[FROM_CLUSTER.index("    nodes") :], "")
-    cluster.generator.fetch_now()
     cluster.look()
     assert FILE not in GitRepo(bare).files()
     assert "bus0" not in cluster.state.config.nodes
