@@ -100,7 +100,7 @@ def test_what_is_more_than_demands_is_listed_and_no_name_of_a_file_adds_lines(
 
 
 def test_at_a_terminal_the_consequence_is_shown_and_just_that_is_merged(
-    strict: GitRepo, branch: str
+    on: On, strict: GitRepo, branch: str
 ) -> None:
     seen, main = at(strict, branch), strict.tip
     with Dialogue("approve", branch, "--state-repo", strict.path) as asked:
@@ -108,23 +108,19 @@ def test_at_a_terminal_the_consequence_is_shown_and_just_that_is_merged(
         for told in (seen, "required by access domain 'perception'", "for vehicle00, proposed"):
             assert told in asked.text
         assert "+ release of-edge-visit-" in asked.text
-        asked.type("y\n")
-        assert asked.end() == 0
-    assert git(strict, "log", "-1", "--merges", "--format=%P", "main").split() == [main, seen]
-
-
-def test_what_changes_while_a_person_looks_at_it_is_not_merged(
-    on: On, strict: GitRepo, branch: str
-) -> None:
-    seen, main = at(strict, branch), strict.tip
-    with Dialogue("approve", branch, "--state-repo", strict.path) as asked:
-        asked.read_until("Approve it? [y/N]:")
-        on.book(OTHER)
+        on.book(OTHER)  # what changes while a person looks at it is not merged
         asked.type("y\n")
         assert asked.end() == 1
         told = " ".join(asked.text.split())  # the terminal has wrapped it
         assert f"{branch} is no longer at commit {seen}, so nothing was changed" in told
     assert strict.tip == main
+    (branch,) = branches(strict.path)
+    seen = at(strict, branch)
+    with Dialogue("approve", branch, "--state-repo", strict.path) as asked:
+        asked.read_until("Approve it? [y/N]:")
+        asked.type("y\n")
+        assert asked.end() == 0
+    assert git(strict, "log", "-1", "--merges", "--format=%P", "main").split() == [main, seen]
 
 
 def test_at_a_terminal_a_rejection_asks_why(strict: GitRepo, branch: str) -> None:

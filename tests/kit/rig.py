@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from demandops.base.errors import InvalidInput
-from demandops.repo.git.remote_repository import Slot
 from demandops.serve.generator import Generator
-from demandops.serve.journal import Receipt, Ticket, open_journal
+from demandops.serve.journal import Receipt, Ticket
 
 from tests.kit.goals import Goal, impossible, leave
 from tests.kit.goals import numbered as goal
@@ -70,14 +69,6 @@ def journaled(operation: str, made: object, received: str, base: str) -> Ticket:
     """Return a ticket as in the journal of a generator that died before it answered a demand."""
     data = {"operation": operation, "goal": made, "received": received, "base": base}
     return Ticket.from_data(data)
-
-
-def leave_in_journal(folder: Path, *tickets: Ticket) -> None:
-    slot = Slot(folder)
-    journal = open_journal(slot.folder)
-    journal.append(tickets)
-    journal.close()
-    slot.close()
 
 
 def wait_until_queued(tickets: Iterable[Ticket]) -> None:

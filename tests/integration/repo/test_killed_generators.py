@@ -104,20 +104,16 @@ def test_a_push_over_http_ends_with_its_generator(http: str, server: Server, bar
         silence.set()
 
 
-def test_a_push_over_ssh_ends_with_its_generator(bare: Path, ssh: Path) -> None:
-    address, silence = f"ssh://host{bare}", ssh.with_name("ssh.push")
-    kill_while_hanging(address, "sleep 1000", hang=silence.touch)
-    silence.unlink()
+def test_a_clone_or_a_push_over_ssh_ends_with_its_generator(bare: Path, ssh: Path) -> None:
+    address = f"ssh://host{bare}"
+    push, fetch = (ssh.with_name(f"ssh.{silent}") for silent in ("push", "fetch"))
+    fetch.touch()
+    kill_while_hanging(address, "sleep 1000")
+    fetch.unlink()
+    kill_while_hanging(address, "sleep 1000", hang=push.touch)
+    push.unlink()
     assert rig.restart(address) is True
     assert rig.operations(bare) == ["op-hanging"]
-
-
-def test_a_clone_over_ssh_ends_with_its_generator(bare: Path, ssh: Path) -> None:
-    silence = ssh.with_name("ssh.fetch")
-    silence.touch()
-    kill_while_hanging(f"ssh://host{bare}", "sleep 1000")
-    silence.unlink()
-    assert rig.restart(f"ssh://host{bare}") is True
 
 
 def test_a_signature_that_an_agent_does_not_give_ends_with_its_generator(

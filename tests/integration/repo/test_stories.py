@@ -12,7 +12,7 @@ import shlex
 import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,11 @@ from demandops.decide.state import rendered_files
 from demandops.model.demand import goals as demand_goals
 from demandops.model.ledger.claim import ClaimKey, path_of
 from demandops.repo import reader
+from demandops.repo.git.remote_repository import Slot
 from demandops.repo.merge_check import merge_check
 from demandops.serve import agenda
 from demandops.serve.generator import Generator
+from demandops.serve.journal import open_journal
 
 from tests.kit import config, git_over_http, goals, plain_yaml, rig
 from tests.kit.cli import Run
@@ -145,11 +147,10 @@ class Story:
         """Leave demands in a journal, as a process that was killed; `main` may be noted."""
         base = self._noted.get("main") or rig.tip(self._bare)
         at = self._clock.now().isoformat()
-        left = [
-            rig.journaled(f"op-{name}", self._goal(told), at, base)
-            for name, told in demands.items()
-        ]
-        rig.leave_in_journal(self._data / "remote", *left)
+        slot = Slot(self._data / "remote")
+        with closing(slot), closing(open_journal(slot.folder)) as journal:
+            for name, told in demands.items():
+                journal.append([rig.journaled(f"op-{name}", self._goal(told), at, base)])
 
     def stop(self, name: str) -> None:
         del self._generators[name]

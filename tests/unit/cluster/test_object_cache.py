@@ -152,8 +152,10 @@ def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: P
         # a demand without a target on that cluster does not wait for the cluster
         without = status.follow("a" * 40, [], "healthy", timeout=60)
         assert without.result(PATIENCE_S).state == "healthy"
+        followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
     finally:
         status.close()
+    assert followed.result(PATIENCE_S).state == "waiting", "closing answers what is followed"
 
 
 def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
@@ -162,14 +164,6 @@ def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
     assert status.why_unreachable(asked) == "no access to cluster w, x"
     assert status.why_unreachable([]) == ""
     status.close()
-
-
-def test_closing_answers_the_rollouts_that_are_still_followed(tmp_path: Path) -> None:
-    status = RolloutWatcher({"away": access(tmp_path)}, Letters())
-    target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)
-    followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
-    status.close()
-    assert followed.result(PATIENCE_S).state == "waiting"
 
 
 def test_what_is_healthy_is_read_again_and_what_failed_before_is_told(tmp_path: Path) -> None:

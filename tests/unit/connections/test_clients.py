@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import Refused
+from demandops.base.errors import InvalidInput
 from demandops.base.settings import data_folder
 from demandops.connections import connection_types
 from demandops.connections.connection import ROUTE_OPTIONS, Route
@@ -87,7 +87,7 @@ def test_what_people_change_in_git_so_that_the_type_cannot_carry_it_is_told(
     route = Route(**{"source": "/a", "target": "/a"} | case.get("route", {}))
     held = replace(claim.connection, topics=(route,))
     ledger = repo.state.ledger.replace(claim.key, replace(claim, held=held))
-    with pytest.raises(Refused) as refused:
+    with pytest.raises(InvalidInput) as refused:
         rendered_files(replace(state(**(NODES | case.get("lost", {}))), ledger=ledger))
     found = refused.value.faults[0]
     assert (found.field, found.message[: len(case["told"])]) == (case["field"], case["told"])
@@ -142,10 +142,6 @@ EXAMPLE = ROOT / "examples" / "connections"
 PAGE = (ROOT / "docs" / "connections.md").read_text()
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
-
-
 def test_the_example_gives_what_the_page_says() -> None:
     found = {str(path.relative_to(EXAMPLE)): path.read_text() for path in EXAMPLE.rglob("*.yaml")}
     request = yaml.safe_load(found.pop("demand.yaml"))
@@ -155,7 +151,7 @@ def test_the_example_gives_what_the_page_says() -> None:
     clients = books.objects("ConfigMap")
     bridge = json.loads((EXAMPLE / "zenoh-vehicle00.json").read_text())
     assert json.loads(clients["zenoh-vehicle00"]["data"]["config.json5"]) == bridge
-    (warning,) = blocks("text")
+    (warning,) = re.findall(r"```text\n(.*?)```", PAGE, re.DOTALL)
     assert decision.warnings == (warning.strip(),)
     (station,) = (item for name, item in clients.items() if "-source-" in name)
     parameters = yaml.safe_load(station["data"]["params.yaml"])["/**/*"]["ros__parameters"]

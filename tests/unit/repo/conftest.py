@@ -1,4 +1,4 @@
-"""Fixtures: an empty Git repository, and who commits."""
+"""A fixture: an empty Git repository."""
 
 from __future__ import annotations
 
@@ -11,8 +11,3 @@ import pytest
 @pytest.fixture
 def repo(tmp_path: Path) -> pygit2.Repository:
     return pygit2.init_repository(str(tmp_path / "repo.git"), bare=True, initial_head="main")
-
-
-@pytest.fixture(autouse=True)
-def _petra_commits(git_environment: None) -> None:
-    """Make Petra the author of what a test commits with git."""
