@@ -16,6 +16,8 @@ from pathlib import Path
 from types import FrameType
 
 import pytest
+from demandops.base import naming
+from demandops.connections import ros
 from demandops.repo.merge_check.rendered_charts import HELM_BIN
 from demandops.serve.generator import Generator
 from hypothesis import HealthCheck, settings
@@ -110,6 +112,17 @@ def synced(request: pytest.FixtureRequest) -> bool:
 def git_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in repo.GIT_ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
+
+
+@pytest.fixture
+def short_digests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    caches = (naming.topic_part, ros._number)
+    monkeypatch.setattr(naming, "MOST_DIGITS", 1)
+    for cached in caches:
+        cached.cache_clear()
+    yield
+    for cached in caches:
+        cached.cache_clear()
 
 
 @pytest.fixture(autouse=True)

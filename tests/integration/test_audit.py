@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-import shutil
 from pathlib import Path
 
 import pytest
-from demandops.cli.main import run as run_command
 
 from tests.golden.cases import GOLDEN, requests_of
 from tests.integration.conftest import On
@@ -22,19 +20,10 @@ PATH = f"{EDGE}/{DETECTION}.yaml"
 IMAGES = "registry/images.yaml"
 
 
-@pytest.fixture(scope="session")
-def _played(bare_template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A state repo after six steps of the experiment: four vehicles joined, two of them left."""
-    folder = Path(shutil.copytree(bare_template, tmp_path_factory.mktemp("played") / "state.git"))
-    assert run_command(["request", *map(str, EXPERIMENT[:6]), "--state-repo", str(folder)]) == 0
-    git(folder, "repack", "-adq")
-    return folder
-
-
 @pytest.fixture
-def played(_played: Path, state: GitRepo) -> GitRepo:
-    shutil.rmtree(state.path)
-    shutil.copytree(_played, state.path)
+def played(on: On, state: GitRepo) -> GitRepo:
+    """A state repo after six steps of the experiment: four vehicles joined, two of them left."""
+    assert on("request", *EXPERIMENT[:6]).code == 0
     return state
 
 

@@ -90,17 +90,3 @@ def test_brackets_without_end_crash_nothing(
     for file, said in zip(files, ran.err.splitlines(), strict=True):
         assert said.startswith(f"error: {file}: ")
         assert "nested" in said
-
-
-def test_the_traps_of_yaml_are_taken_as_text(on: On) -> None:
-    texts = ["yes", "null", "~", "1e3", "0o7", "010", "12:30:45", "2026-01-31", "0x1F", "<<"]
-    items = [
-        f"- {{id: {written}, type: 1, requester_ids: [{written}], source_node_id: vehicle00, "
-        f"target_node_id: edge, source_topics: [/a{number}], target_topics: [/a{number}]}}"
-        for number, written in enumerate((*(f'"{text}"' for text in texts), "2026-02-01"))
-    ]
-    on.json("request", "-", stdin="id: x\nconnections:\n" + "\n".join(items))
-    connections = on.json("bookkeeping")["connections"]
-    assert {id: entry["requesters"] for id, entry in connections.items()} == {
-        text: [text] for text in (*texts, "2026-02-01")
-    }

@@ -43,14 +43,6 @@ def without_labels(document: Any) -> Any:
     return document | {"metadata": metadata}
 
 
-def ledger(state: GitRepo) -> dict[str, Any]:
-    return {
-        path: yaml.safe_load(text)
-        for path, text in state.files("ledger/").items()
-        if path.endswith(".yaml")
-    }
-
-
 def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_outputs_alone(
     on: On, state: GitRepo
 ) -> None:
@@ -59,7 +51,7 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
     books = on("bookkeeping", "--output", "json").json()
     assert "od-edge-station00" in books["services"]
     assert on("log").code == on("why", "od-edge-station00").code == 0
-    old, old_ledger = state.files(), ledger(state)
+    old, old_ledger = state.files(), state.ledger()
     # the output topics of a fusion have other names today
     topics = re.compile(r" /(edge|cloud)/(\w+_(?:raw_objects|global_\w+))$", re.M)
     manifests = {path: topics.sub(r" /\1_\2", text) for path, text in state.manifests().items()}
@@ -70,7 +62,7 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
     assert on("upgrade").out.endswith(f"git show main:{BOOTSTRAP} | kubectl apply -f -\n")
     new = state.files()
     assert on("bookkeeping", "--output", "json").json() == books | {"commit": state.tip}
-    for path, file in ledger(state).items():
+    for path, file in state.ledger().items():
         assert file["apiVersion"] == LEDGER_API_VERSION
         if file["kind"] == "Claim":
             of_both = ("demand", "request", "requesters", "booked")
@@ -97,12 +89,8 @@ def test_demands_of_before_are_given_up_and_restored_after_the_upgrade(
     assert on("upgrade").code == 0
     assert not state.files("ledger/shutdowns/")
     assert on("request", EXPERIMENT / "6-vehicle01-leaves.yaml").code == 0
-    assert not any("vehicle01" in file.get("requesters", ()) for file in claims(state))
+    assert not any("vehicle01" in f.get("requesters", ()) for f in state.ledger().values())
     assert on("rollback", before, "--reason", "try", "--drop-newer", "-y").code == 0
-    assert any("vehicle01" in file["requesters"] for file in claims(state))
+    assert any("vehicle01" in f.get("requesters", ()) for f in state.ledger().values())
     assert on("verify").code == 0
     assert git(state, "fsck", "--strict") == ""
-
-
-def claims(state: GitRepo) -> list[Any]:
-    return [file for file in ledger(state).values() if file["kind"].endswith("Claim")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from demandops.base import naming
 from demandops.cli.changes.configure import name_of
 
 from tests.integration.conftest import On
@@ -22,9 +21,8 @@ def joined(on: On, state: GitRepo) -> GitRepo:
 
 
 def test_a_resume_ends_no_suspension_of_another_selection_with_the_same_name(
-    on: On, joined: GitRepo, monkeypatch: pytest.MonkeyPatch
+    on: On, joined: GitRepo, short_digests: None
 ) -> None:
-    monkeypatch.setattr(naming, "MOST_DIGITS", 1)
     suspend = ("suspend", "--node", "vehicle00", "-m", "Sold", "-y")
     name = name_of({"nodes": ("vehicle00",)})
     patterns = ("vehicle00" + "*" * number for number in range(1, 100))

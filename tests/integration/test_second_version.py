@@ -57,11 +57,6 @@ def clock() -> Clock:
     return clock
 
 
-def ledger(state: GitRepo) -> list[dict[str, Any]]:
-    files = state.files("ledger/").items()
-    return [plain_yaml.load(text) for path, text in files if path.endswith(".yaml")]
-
-
 def assert_verified(on: On, since: str) -> None:
     assert all(row["holds"] for row in on("verify", f"{since}..", "-o", "json").json())
     assert git(on.state, "fsck", "--strict", "--no-dangling", "--no-progress") == ""
@@ -78,7 +73,7 @@ def test_its_history_verifies_and_check_and_upgrade_name_the_faults_on_main(
 ) -> None:
     assert (state.tip, branches(state.path)) == (FACTS["main"], [FACTS["proposal"]["branch"]])
     assert_verified(on, root(state.path))
-    assert Counter(file["kind"] for file in ledger(state)) == FACTS["kinds"]
+    assert Counter(file["kind"] for file in state.ledger().values()) == FACTS["kinds"]
     services = on("bookkeeping", "--output", "json").json()["services"]
     names = {path.rpartition("/")[2].removesuffix(".yaml") for path in state.manifests()}
     assert services.keys() <= {*FACTS["releases"]} <= names
@@ -104,7 +99,7 @@ def test_a_generator_publishes_the_journal_once_and_keeps_the_proposal_open(
     assert sorted(published) == pending
     (shown,) = on("get", "proposals", "--output", "json").json()["items"]
     assert shown["branch"] == proposal["branch"]
-    held = {file["demand"] for file in ledger(state) if file["kind"] == "Claim"}
+    held = {file["demand"] for file in state.ledger().values() if file["kind"] == "Claim"}
     assert held & {"visit", "pending-put", "closed"} == {"pending-put"}
     assert_verified(on, FACTS["main"])
 
@@ -131,7 +126,7 @@ def test_an_upgrade_takes_every_claim_and_waiting_demand_along(
     assert (gone, carried.keys() - carried_before.keys()) == (DOUBLED, set())
     listed = (each.get("listed", {}).values() for each in carried.values())
     assert {id for topics in listed for ids in topics for id in ids} == DOUBLED
-    kinds = Counter((file["kind"], file["apiVersion"]) for file in ledger(state))
+    kinds = Counter((file["kind"], file["apiVersion"]) for file in state.ledger().values())
     assert {version for _, version in kinds} == {"demandops.ledger/v3"}
     assert {kind for kind, _ in kinds} == {"Claim", "WaitingDemand", "EndedOverride"}
     ended = {*manifests} - {*state.manifests()}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 from hypothesis import HealthCheck, Phase, note, settings
@@ -45,3 +46,9 @@ def told(requests: list[Goal]) -> list[Goal]:
     for request in requests:
         note(json.dumps({key: what for key, what in request.items() if what not in ([], False)}))
     return requests
+
+
+def rival(id: str, name_of: Callable[[str], str]) -> str:
+    """Return another id with the same name; the fixture ``short_digests`` lets chance find one."""
+    others = (f"{id}/{'-' * number}" for number in count(1))
+    return next(other for other in others if name_of(other) == name_of(id))

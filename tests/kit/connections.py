@@ -12,7 +12,6 @@ from demandops.model.config.load import load
 
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, skeleton, state_of
-from tests.kit.memory import MemoryRepo
 
 REACHABLE = {"zenoh": {"endpoint": "tcp/edge:7447"}}
 SPEAKS: dict[str, Any] = {"zenoh": {}}
@@ -71,7 +70,3 @@ def routes(demand: Mapping[str, Any]) -> dict[str, Any]:
     if demand.get("shutdown"):
         return head | {"operation": "release"}
     return head | {"connections": connections}
-
-
-def decided(before: State, demand: Mapping[str, Any]) -> State:
-    return MemoryRepo(state=before).decide(routes(demand)).state

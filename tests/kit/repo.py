@@ -104,6 +104,10 @@ class GitRepo:
         repo, index = _index(self.path, revision)
         return {e.path: repo[e.id].data.decode() for e in index if e.path.startswith(under)}
 
+    def ledger(self) -> dict[str, Any]:
+        files = self.files("ledger/").items()
+        return {path: plain_yaml.load(text) for path, text in files if path.endswith(".yaml")}
+
     def manifests(self) -> dict[str, str]:
         return {p: text for p, text in self.files("clusters/").items() if p.endswith(".yaml")}
 

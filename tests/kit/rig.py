@@ -150,7 +150,9 @@ class Proposed:
 
         wait_until(proposed, "the demand is proposed")
         assert proposed()[-1].startswith("awaiting approval: demand/")
-        return proposed()[-1].split()[2]
+        name = proposed()[-1].split()[2]
+        assert name.isascii() and len(name) < 70, "whatever ids the demand has"
+        return name
 
     def outcome(self) -> str:
         return outcome(self.ticket)

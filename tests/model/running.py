@@ -31,10 +31,6 @@ MAY = {
 """For each requester, the names under which it may demand the node ``hall``."""
 MOST = 3
 
-Instance = tuple[str, str]
-"""An application's id, and its node."""
-
-
 Service = tuple[str, str]
 """An application's id, and its node."""
 Link = tuple[str, str, str]
@@ -145,8 +141,8 @@ class Running(Places):
             raise Refused("it may not demand the node")
         return app | {"id": id, "node": node, "version": asked}
 
-    def demanded(self) -> dict[Instance, frozenset[str]]:
-        found: dict[Instance, frozenset[str]] = {}
+    def demanded(self) -> dict[Service, frozenset[str]]:
+        found: dict[Service, frozenset[str]] = {}
         for id, claim in self.on("application"):
             if claim.fixed["type"] == TALLY:
                 one = id, claim.fixed["node"]
@@ -154,5 +150,5 @@ class Running(Places):
                 found[one] = found.get(one, frozenset()).union(topics)
         return found
 
-    def replicas(self, one: Instance) -> int:
+    def replicas(self, one: Service) -> int:
         return min(MOST, len(self.demanded()[one]))

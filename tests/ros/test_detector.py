@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from demandops.detect.rule_file import read
 from demandops_ros.detector.detector_node import read_bookkeeping
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 
 from tests.kit.cli import Run
@@ -21,6 +21,7 @@ from tests.kit.goals import put
 from tests.kit.live import Step, heard_live, told
 from tests.kit.repo import git
 from tests.kit.ros import Client, Serve, Servers
+from tests.ros.test_following import Diagnostics
 
 NEAR, AWAY = 50.0, 91.0
 
@@ -43,16 +44,11 @@ def test_who_comes_near_demands_until_it_leaves_and_rules_are_reloaded(
     rules.write_text(rules_of().replace("node: edge", "node: egde"))
     renamed = ("--ros-args", "-r", "__node:=watcher")  # as the launch file does
     detecting = servers.run(served.state_repo, "detect", str(rules), *renamed)
-    statuses: dict[str, Any] = {}
-
-    def hear(message: Any) -> None:
-        statuses.update({status.name: status for status in message.status})
-
+    heard = Diagnostics(client)
     away, poses = {"vehicle00": NEAR, "vehicle01": NEAR}, {}
     for vehicle in away:
         topic = f"/vehicles/{vehicle}/pose"
         poses[vehicle] = client.node.create_publisher(PoseStamped, topic, 10)
-    client.node.create_subscription(DiagnosticArray, "/diagnostics", hear, 10)
 
     def drive() -> None:
         for vehicle, publisher in poses.items():
@@ -63,7 +59,7 @@ def test_who_comes_near_demands_until_it_leaves_and_rules_are_reloaded(
     client.node.create_timer(0.1, drive)
 
     def warns_of(part: str) -> Callable[[], bool]:
-        return lambda: getattr(statuses.get(f"demandops_detector: {part}"), "level", 0) == b"\x01"
+        return lambda: heard.is_at(f"demandops_detector: {part}", DiagnosticStatus.WARN)
 
     def held() -> set[str]:
         return {*served.bookkeeping().get("demands", {})}

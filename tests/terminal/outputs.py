@@ -32,7 +32,6 @@ _LISTED = plain_yaml.load(Path(__file__).with_name("commands.yaml").read_text())
 COMMANDS, CHANGING = tuple(_LISTED["unchanged"]), tuple(_LISTED["changing"])
 NOT_SHOWN = _LISTED["not shown"]
 
-PROPOSED = ("for-each-ref", "--format=%(objectname)", "refs/heads/demand")
 _HEX = re.compile(
     r"\b(?=[0-9a-f]*\d)[0-9a-f]{10}(?:[0-9a-f]{30})?\b|(?<!\S)(?=[0-9a-f]*\d)[0-9a-f]{12}\b"
 )
@@ -107,7 +106,7 @@ def printed(command: str, patch: pytest.MonkeyPatch) -> str:
         text = text.replace(str(Path.cwd()), "/home/petra")
     if command == "version":
         text = re.sub(r"\d[\w.+-]*", "1.2.3", text)
-    return same_ids(text)
+    return _HEX.sub(lambda found: "c" * len(found[0]), text)
 
 
 def _interrupt(seconds: float) -> None:
@@ -128,11 +127,6 @@ def _help(command: click.Command, name: str, parent: click.Context) -> Iterator[
     if isinstance(command, click.Group):
         for each in sorted(command.commands):
             yield from _help(command.commands[each], each, context)
-
-
-def same_ids(text: str) -> str:
-    """Return a text in which the letter `c` replaces each digit of the commit ids."""
-    return _HEX.sub(lambda found: "c" * len(found[0]), text)
 
 
 def file_of(command: str) -> Path:

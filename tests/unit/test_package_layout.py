@@ -85,7 +85,7 @@ def test_a_folder_has_at_most_twelve_modules() -> None:
     assert {name: number for name, number in count.items() if number > MOST_MODULES} == {}
 
 
-PACKAGE = Path(__file__).parents[2] / "ros_bridge" / "ros_package"
+PACKAGE = ROOT / "ros_bridge" / "ros_package"
 
 
 @pytest.mark.parametrize(("name", "program"), [("demandops", "serve"), ("detector", "detect")])
@@ -177,7 +177,6 @@ def test_the_process_with_limits_starts_without_what_is_slow_or_to_be_kept() -> 
 # ---- the tests ----
 
 
-ROOT = Path(__file__).parents[2]
 NAMED = re.compile(r"`(tests/[\w/]+\.py)::([\w:]+)(?:\[([^\]`]+)\])?`")
 
 

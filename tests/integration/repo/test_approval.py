@@ -101,21 +101,3 @@ def test_gitlab_is_asked_for_a_merge_request_by_push_options_if_it_takes_them(
     wanted = [f"title={TITLE}\n", "description=This demand needs approval", "create\n"]
     wanted += ["target=main\n", "remove_source_branch\n", "label=demand\n", "label=its\n"]
     assert all((f"=merge_request.{one}" in options) is takes_options for one in wanted), options
-
-
-def test_odd_ids_give_branches_that_git_takes(
-    bare: Path, petra: Person, generator: Generator
-) -> None:
-    ids = ["", "..", "a..b/.lock", "Ä ö", "x" * 900, "-o", "@{0}"]
-    tickets = [generator.submit(goal(number) | {"id": id}) for number, id in enumerate(ids)]
-
-    def are_decided_or_wait() -> bool:
-        waiting = (each.proposal and each.proposal.pushed for each in tickets)
-        return all(
-            waits or each.future.done() for each, waits in zip(tickets, waiting, strict=True)
-        )
-
-    rig.wait_until(are_decided_or_wait, "each is refused, or waits on a branch")
-    names = branches(bare)
-    assert len(names) >= 4
-    assert all(len(name) < 70 and name.isascii() for name in names)

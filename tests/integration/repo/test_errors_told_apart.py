@@ -18,12 +18,11 @@ from demandops.repo.history.commit_message import generator_signature
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
-from tests.kit.cli import PROGRAM, Run, process
-from tests.kit.connections import IMAGES
+from tests.kit.cli import Run
 from tests.kit.limits import files_end_at
 from tests.kit.memory import NOW
 from tests.kit.repo import git, tip
-from tests.kit.rig import Person, Stages, goal
+from tests.kit.rig import Stages, goal
 
 
 @pytest.mark.parametrize(
@@ -213,20 +212,6 @@ def test_a_clone_that_cannot_be_read_meanwhile_is_named_and_waited_for(
         away.rename(file)
         assert rig.receipt(ticket).outcome == "booked"
     rig.assert_sound(bare)
-
-
-def test_a_file_that_the_state_in_effect_had_and_git_lost_is_told(
-    bare: Path, tmp_path: Path, person: Person
-) -> None:
-    valid = tip(bare)
-    with rig.running(bare) as generator:  # it reads the last valid version of a file by its id
-        person.change({IMAGES: "kind: [\n"})
-        rig.book(generator, goal(1))
-    lost = rig.lose(bare, f"{valid}:{IMAGES}")
-    told = process(*PROGRAM, "bookkeeping", "--state-repo", bare)  # without caches
-    assert told.code == 1, told
-    assert f"{IMAGES} of commit {valid[:10]}" in told.err
-    assert lost in told.err
 
 
 def test_a_checkout_that_lacks_a_file_is_told_by_check(

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import count
 from pathlib import Path
 
 import pytest
 import yaml
-from demandops.base import naming
 from demandops.base.naming import Subject, SubjectKind
 from demandops.model.ledger import claim as claim_files
 from demandops.repo import reader
@@ -16,6 +13,7 @@ from demandops.repo.merge_check import merge_check
 from demandops.repo.write.proposal_branch import branch_name
 
 from tests.kit import rig
+from tests.kit.chance import rival
 from tests.kit.goals import Goal, application, goal
 from tests.kit.repo import Person, branches, read
 from tests.kit.rig import Proposed
@@ -23,16 +21,6 @@ from tests.kit.rig import Proposed
 
 def joining(id: str, node: str = "edge") -> Goal:
     return goal([application(id, node=node, who=[id[-5:]])], id=f"request {id[-5:]}")
-
-
-@pytest.fixture
-def short_digests(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(naming, "MOST_DIGITS", 1)
-
-
-def rival(id: str, name_of: Callable[[str], str]) -> str:
-    others = (f"{id}/{'-' * number}" for number in count(1))
-    return next(other for other in others if name_of(other) == name_of(id))
 
 
 def claims(bare: Path) -> set[str]:

@@ -30,26 +30,18 @@ def condition(kind: str, status: str, message: str = "") -> dict[str, str]:
     return {"type": kind, "status": status, "message": message, "lastTransitionTime": at}
 
 
-def deployment(name: str, *conditions: Any, of: str = "", **status: Any) -> dict[str, Any]:
-    labels = {"helm.toolkit.fluxcd.io/name": of} if of else {}
-    metadata = {"name": name, "namespace": "ns", "generation": 3, "labels": labels}
-    whole = {"observedGeneration": 3, "updatedReplicas": 2, "availableReplicas": 2}
-    found = whole | status | {"conditions": list(conditions)}
-    return {"metadata": metadata, "spec": {"replicas": 2}, "status": found}
-
-
 def deployments(case: Case) -> dict[tuple[str, str, str], dict[str, Any]]:
     """Return the Deployments of a case; ``tracked`` is Argo CD's name of what they belong to."""
     found = {}
     for name, fields in case.get("deployments", {}).items():
-        status = {**fields}
-        conditions = [condition(*one) for one in status.pop("conditions", ())]
-        tracked = {"argocd.argoproj.io/tracking-id": status.pop("tracked", "")}
-        generation, replicas = status.pop("generation", 3), status.pop("replicas", 2)
-        made = deployment(name, *conditions, **status)
-        made["metadata"] |= {"annotations": tracked, "generation": generation}
-        made["spec"]["replicas"] = replicas
-        found["Deployment", "ns", name] = made
+        status = {"observedGeneration": 3, "updatedReplicas": 2, "availableReplicas": 2} | fields
+        status["conditions"] = [condition(*one) for one in status.get("conditions", ())]
+        metadata = {"name": name, "namespace": "ns", "generation": status.pop("generation", 3)}
+        of = status.pop("of", "")
+        metadata["labels"] = {"helm.toolkit.fluxcd.io/name": of} if of else {}
+        metadata["annotations"] = {"argocd.argoproj.io/tracking-id": status.pop("tracked", "")}
+        spec = {"replicas": status.pop("replicas", 2)}
+        found["Deployment", "ns", name] = {"metadata": metadata, "spec": spec, "status": status}
     return found
 
 

@@ -35,13 +35,18 @@ from tests.unit.cluster.cases import Letters
 OVER = ObjectSelector("Application", "argocd", "demandops-perception")
 CHILDREN = ObjectSelector("Application", "perception")
 DEPLOYMENTS = ObjectSelector("Deployment", "perception")
+AWAY = "http://127.0.0.1:1"
+
+
+def access(folder: Path, url: str = AWAY) -> ClusterAccess:
+    return ClusterAccess(kubeconfig=kubeconfig(folder, url))
 
 
 @dataclass
 class Api:
     """An API server with an Application in each namespace; it records the paths of calls."""
 
-    reached: ClusterAccess
+    cache: ObjectCache
     asked: list[str] = field(default_factory=list)
     refused: str = "nothing"
 
@@ -55,16 +60,12 @@ def api(tmp_path: Path) -> Iterator[Api]:
         return Answer.json(listed, 403 if api.refused in call.path else 200)
 
     with serving(answer) as server:
-        api = Api(ClusterAccess(kubeconfig=kubeconfig(tmp_path, server.url)))
+        api = Api(ObjectCache("c-its", access(tmp_path, server.url), lambda: None))
         yield api
 
 
-def store(api: Api) -> ObjectCache:
-    return ObjectCache("c-its", api.reached, lambda: None)
-
-
 def test_one_object_is_asked_for_by_its_name(api: Api) -> None:
-    read = store(api)
+    read = api.cache
     why = read.why_unavailable("perception", "mqtt-edge")
     assert why == "", "of a Deployment that is not known"
     read.read_once([OVER, CHILDREN])
@@ -79,7 +80,7 @@ def test_one_object_is_asked_for_by_its_name(api: Api) -> None:
 
 def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
     api.refused = "/argocd/"
-    read = store(api)
+    read = api.cache
     read.read_once([OVER, CHILDREN])
     assert read.why_unknown([OVER]) == "applications in argocd: Forbidden"
     assert read.why_unknown([CHILDREN]) == ""
@@ -87,8 +88,7 @@ def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
 
 
 def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:
-    away = ClusterAccess(kubeconfig=kubeconfig(tmp_path, "http://127.0.0.1:1"))
-    read = ObjectCache("away", away, lambda: None)
+    read = ObjectCache("away", access(tmp_path), lambda: None)
     read.read_once([OVER, CHILDREN])
     assert read.why_unknown([OVER]) == "Connection refused"
     assert read.why_unknown([CHILDREN]) == read.why_unknown([OVER])
@@ -96,7 +96,7 @@ def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:
 
 def test_since_when_a_cluster_cannot_be_read_is_known_until_it_can(api: Api) -> None:
     api.refused = "perception"
-    cache = store(api)
+    cache = api.cache
     cache.watch([DEPLOYMENTS])
     wait_until(lambda: cache.unread_since, "the first answer has come")
     target = Target(ClusterDomain("c-its", "d", "perception"), "r", is_service=True)
@@ -124,8 +124,7 @@ def test_a_watch_that_lags_takes_nothing_back(tmp_path: Path) -> None:
         return Answer.json({"metadata": {"resourceVersion": "8"}, "items": [item("one", 10)]})
 
     with serving(answer) as server:
-        reached = ClusterAccess(kubeconfig=kubeconfig(tmp_path, server.url))
-        cache = ObjectCache("c-its", reached, lambda: None)
+        cache = ObjectCache("c-its", access(tmp_path, server.url), lambda: None)
         cache.watch([DEPLOYMENTS])
         wait_until(lambda: len(cache.objects()) == 2, "both events have come")
         one = cache.objects()["Deployment", "perception", "one"]
@@ -136,12 +135,9 @@ def test_a_watch_that_lags_takes_nothing_back(tmp_path: Path) -> None:
         is_over.set()
 
 
-AWAY = "http://127.0.0.1:1"
-
-
 def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: Path) -> None:
-    file, clock = kubeconfig(tmp_path, AWAY), Clock(NOW)
-    status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters(), runtime=clock)
+    clock = Clock(NOW)
+    status = RolloutWatcher({"away": access(tmp_path)}, Letters(), runtime=clock)
     try:
         target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)
         late = status.follow("a" * 40, [target], "healthy", timeout=60)
@@ -169,8 +165,7 @@ def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
 
 
 def test_closing_answers_the_rollouts_that_are_still_followed(tmp_path: Path) -> None:
-    file = kubeconfig(tmp_path, AWAY)
-    status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
+    status = RolloutWatcher({"away": access(tmp_path)}, Letters())
     target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)
     followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
     status.close()
@@ -184,8 +179,7 @@ def test_what_is_healthy_is_read_again_and_what_failed_before_is_told(tmp_path: 
     with kube_api() as api:
         api.flux("ns", "d", "a")
         api.deployment("ns", "r")
-        reached = ClusterAccess(kubeconfig=kubeconfig(tmp_path, api.url))
-        status = RolloutWatcher({"c": reached}, Letters(), runtime=clock)
+        status = RolloutWatcher({"c": access(tmp_path, api.url)}, Letters(), runtime=clock)
         follow = partial(status.follow, "a", [target], "healthy")
         assert follow(60).result(PATIENCE_S).state == "healthy"
         api._items["deployments", "ns", "r"]["status"]["availableReplicas"] = 0  # no watch tells it
@@ -289,9 +283,8 @@ class Told:
     """The nodes of a cluster, and how often a change was told."""
 
     def __init__(self, folder: Path, url: str) -> None:
-        access = ClusterAccess(kubeconfig=kubeconfig(folder, url))
         self.times = 0
-        self.all = ClusterNodes({"c-its": access}, self._tell)
+        self.all = ClusterNodes({"c-its": access(folder, url)}, self._tell)
 
     def _tell(self) -> None:
         self.times += 1
@@ -383,7 +376,7 @@ def test_only_the_nodes_that_are_asked_for_are_read(tmp_path: Path) -> None:
 def test_a_cluster_that_cannot_be_read_has_no_nodes(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    told = Told(tmp_path, "http://127.0.0.1:1")
+    told = Told(tmp_path, AWAY)
     assert told.by_name() == {}
     why = "the nodes of cluster 'c-its' cannot be read (Connection refused) and stay as they are"
     wait_until(lambda: why in caplog.text, "the warning")

@@ -64,13 +64,6 @@ def faults(books: MemoryRepo, asked: Goal) -> tuple[Fault, ...]:
     return refused.faults
 
 
-def test_a_demand_that_lists_too_much_is_refused_at_once() -> None:
-    clouds = [(f"/a/b{i}", "vehicle00") for i in range(10_000)]
-    (found,) = faults(MemoryRepo(), goal([application(clouds=clouds)]))
-    assert (found.field, found.code) == ("id", "too-large")
-    assert "limits.demandItems" in found.message
-
-
 @pytest.mark.parametrize("key", ["k{}".format, int])
 def test_a_demand_with_too_many_fields_is_refused_at_once(key: Callable[[int], Any]) -> None:
     fields = {key(number): 0 for number in range(2_000)}

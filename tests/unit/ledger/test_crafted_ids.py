@@ -6,7 +6,7 @@ The tests of refusals shorten digests to one digit, so that names are the same b
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 from random import Random
@@ -17,7 +17,6 @@ import yaml
 from demandops.base import naming
 from demandops.base.errors import InvalidInput, Refused
 from demandops.base.naming import SubjectKind, id_problem
-from demandops.connections import ros
 from demandops.decide.booking import Drain
 from demandops.decide.checks import collisions
 from demandops.decide.decision import decide
@@ -33,24 +32,13 @@ from demandops.model.ledger.records import Wait, WaitingDemand
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.kit.chance import chances, examples, told, visible
+from tests.kit.chance import chances, examples, rival, told, visible
 from tests.kit.config import configuration, override, skeleton, state_of
 from tests.kit.goals import CLOUD, Goal, application, connection, goal, put
 from tests.kit.memory import NOW, MemoryRepo, ledger_in, outcome, rebuilt
 from tests.kit.plain_yaml import FAST
 
 NODES = "inventory/nodes.yaml"
-
-
-@pytest.fixture
-def short_digests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    caches = (naming.topic_part, ros._number)
-    monkeypatch.setattr(naming, "MOST_DIGITS", 1)
-    for cached in caches:
-        cached.cache_clear()
-    yield
-    for cached in caches:
-        cached.cache_clear()
 
 
 alike = st.builds(
@@ -142,12 +130,6 @@ def test_whatever_the_ids_each_has_its_own_names_and_files_or_is_refused(
     for request in refused:
         assert outcome(repo.take(request)) == outcome(MemoryRepo().take(request))
         repo.take(end_of(request))
-
-
-def rival(id: str, name_of: Callable[[str], str]) -> str:
-    """Return another id with the same name."""
-    others = (f"{id}/{'-' * number}" for number in range(1, 1000))
-    return next(other for other in others if name_of(other) == name_of(id))
 
 
 @pytest.mark.usefixtures("short_digests")

@@ -17,7 +17,7 @@ from demandops.cli.authoring.schema import SCHEMAS
 from demandops.decide.state import State
 
 from tests.kit import plain_yaml
-from tests.kit.connections import decided, demand, routes
+from tests.kit.connections import demand, routes
 from tests.kit.connections import state as with_nodes
 from tests.kit.goals import perception
 from tests.kit.memory import MemoryRepo
@@ -88,10 +88,10 @@ def _broken_by(fields: dict[str, Any]) -> tuple[Fault, ...]:
 def _refused_connection(
     asks: dict[str, Any], nodes: str = "able", held: Iterable[dict[str, Any]] = (), **more: Any
 ) -> tuple[Fault, ...]:
-    before = with_nodes(**more, **_CONNECTIONS["nodes"][nodes])
+    repo = MemoryRepo(state=with_nodes(**more, **_CONNECTIONS["nodes"][nodes]))
     for one in held:
-        before = decided(before, demand(**one))
-    return _refusal(routes(demand(**asks)), before=before)
+        repo.send(routes(demand(**one)))
+    return _refusal(routes(demand(**asks)), before=repo.state)
 
 
 def _refusal(goal: object, *, before: State | None = None) -> tuple[Fault, ...]:

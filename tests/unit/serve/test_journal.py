@@ -126,14 +126,6 @@ def test_no_missing_doubled_or_moved_entry_is_overlooked(path: Path, text: bytes
             assert str(error.value).startswith("outbox.jsonl: line ")
 
 
-def test_a_damaged_journal_is_refused_with_the_line_and_the_remedy(path: Path, text: bytes) -> None:
-    damaged = text.replace(b"wish", b"wash", 2)
-    path.write_bytes(damaged)
-    with pytest.raises(DamagedJournal, match=r"line 1 is .* `demandops journal --set-aside`"):
-        Journal(path)
-    assert path.read_bytes() == damaged
-
-
 def test_the_file_stays_small_however_many_demands_pass_and_wait(path: Path) -> None:
     journal, waiting = Journal(path), 1000
     journal.append(entry(f"waiting-{number}") for number in range(waiting))
