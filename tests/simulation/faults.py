@@ -258,7 +258,7 @@ FAULTS: dict[str, Fault] = {
         lambda attempt, worker, *given: attempt(with_(worker, _tip_is_fresh=True), *given)),
     "drop_what_a_batch_has_left": Fault(1, Demands, "put_back", lambda *given: given[2].clear()),
     "bring_back_what_was_deleted": Fault(1, CommitBatch, "follow", undoing_deletions),
-    "answer_before_a_last_merge_is_seen": Fault(382890171, Approvals, "_has_moved",
+    "answer_before_a_last_merge_is_seen": Fault(119, Approvals, "_has_moved",
         lambda *_: False),
     "book_again_what_was_approved": Fault(0, Approvals, "_receipt", booking_again),
     "turn_down_what_waits": Fault(1, ProposalBranches, "put", lambda *_: ""),
