@@ -186,6 +186,7 @@ def test_several_nodes_get_the_types_that_they_have_and_what_they_had_before(
     hold(cluster, text=json.dumps({"first": odd, "second": section}))
     sync, state = start_sync(servers, tmp_path, "first", "second"), tmp_path / "state"
     client.wait(lambda: state.is_file() and "rate is DOUBLE there, not STR" in state.read_text())
+    client.wait(lambda: "not yet" in sync.log.read_text())
     hold(cluster, text=json.dumps({"first": section, "second": section}))
     client.wait(lambda: nodes[0].get_parameter("rate").value == 10.0)
     assert list(nodes[0].get_parameter("ids").value) == []

@@ -151,7 +151,7 @@ FAULTS: dict[str, Fault] = {
     "take_one_common_requester_for_the_owner": Fault(3, permission, "stranger_faults",
         lambda faults, request, owners, *more:
             () if {*owners} & {*request.requesters()} else faults(request, owners, *more)),
-    "release_only_the_first_claim": Fault(161, booking, "claims_of", first_only),
+    "release_only_the_first_claim": Fault(214, booking, "claims_of", first_only),
     "replace_what_was_joined": Fault(11, Application, "extended", lambda _, app, more: more,
         (Connection, "extended", lambda _, connection, more: more)),
     "grant_one_claim_too_many": Fault(2, forbidden, "_held",
@@ -176,7 +176,7 @@ FAULTS: dict[str, Fault] = {
     "share_one_instance": Fault(0, completing, "_separated", itself),
     "move_instances_with_the_channel": Fault(0, completing, "_separated",
         lambda separated, app, config: replace(separated(app, config), version=app.version)),
-    "keep_the_channel_of_the_default_version": Fault(55, completing, "_separated",
+    "keep_the_channel_of_the_default_version": Fault(95, completing, "_separated",
         lambda separated, app, config:
             made if (made := separated(app, config)).separate else app),
     "take_the_first_domain": Fault(2, Config, "nodes_of", lambda _, config, node: (node,)),
@@ -200,7 +200,7 @@ FAULTS: dict[str, Fault] = {
     # ---- placement ----
     "let_the_last_in_first": Fault(1, agenda, "in_turn",
         lambda in_turn, *given: in_turn(*given)[::-1]),
-    "ignore_priorities": Fault(187, WaitingDemand, "turn",
+    "ignore_priorities": Fault(79, WaitingDemand, "turn",
         lambda _, one: (one.since, one.demand)),
     "begin_the_wait_anew": Fault(3, decision, "_wait",
         lambda wait, state, demand, reasons, now, *more:
@@ -229,7 +229,7 @@ FAULTS: dict[str, Fault] = {
         lambda plan, before, after, *more: plan(before, with_(after, overrides=()), *more)),
     "apply_overrides_only_to_new_demands": Fault(0, snapshot, "render_all",
         lambda _, tree, state, more=None: Changeset({**(more or {})}, ())),
-    "let_the_lowest_priority_win": Fault(151, World, "__post_init__",
+    "let_the_lowest_priority_win": Fault(173, World, "__post_init__",
         lambda right, world: [right(world), with_(world, overrides=world.overrides[::-1])]),
     "override_all_nodes": Fault(0, overrides, "fits",
         lambda fits, selector, traits, config:
@@ -258,7 +258,7 @@ FAULTS: dict[str, Fault] = {
         lambda attempt, worker, *given: attempt(with_(worker, _tip_is_fresh=True), *given)),
     "drop_what_a_batch_has_left": Fault(1, Demands, "put_back", lambda *given: given[2].clear()),
     "bring_back_what_was_deleted": Fault(1, CommitBatch, "follow", undoing_deletions),
-    "answer_before_a_last_merge_is_seen": Fault(382890171, Approvals, "_has_moved",
+    "answer_before_a_last_merge_is_seen": Fault(119, Approvals, "_has_moved",
         lambda *_: False),
     "book_again_what_was_approved": Fault(0, Approvals, "_receipt", booking_again),
     "turn_down_what_waits": Fault(1, ProposalBranches, "put", lambda *_: ""),
