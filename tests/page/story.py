@@ -76,12 +76,13 @@ class Story:
         commit = str(self.generator.snapshot.commit)
         since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")
         self.api.flux(NAMESPACE, "perception", commit)
-        for release, target in self.follower.at(commit).targets:
-            if target.is_service:
-                fault = FAULT if release.name == FAILING and not mended else ""
-                self.api.helm_release(NAMESPACE, release.name, fault, since)
+        for planned in self.follower.at(commit).running:
+            name = planned.release.name
+            if planned.target.is_service:
+                fault = FAULT if name == FAILING and not mended else ""
+                self.api.helm_release(NAMESPACE, name, fault, since)
             else:
-                self.api.deployment(NAMESPACE, release.name)
+                self.api.deployment(NAMESPACE, name)
 
 
 @contextmanager
