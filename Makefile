@@ -19,7 +19,8 @@ KILL_TESTS := tests/ros/test_crash.py
 PROCESS_TESTS := tests/ros tests/conformance tests/experiment tests/unit/decide/test_budget.py \
   $(addprefix tests/integration/,repo mqtt web \
     test_command_line.py test_get.py test_hostile_checkouts.py test_inbound_webhook.py \
-    test_interrupted_request.py test_person_commands.py test_proposals.py test_upgrade.py)
+    test_interrupted_request.py test_odd_environment.py test_person_commands.py test_pipelines.py \
+    test_proposals.py test_upgrade.py)
 # One worker more than cores, because one is busy with the tests of ROS, which mostly wait.
 WORKERS := $(shell echo $$(($$(nproc) + 1)))
 # The ROS nodes of the tests and the demo talk on this machine only.
