@@ -252,11 +252,9 @@ class EntryPatterns(Generic[Entry]):
         try:
             entry = pattern.entry(id)
             if (name := getattr(entry, self._refers)) not in self._known:
-                field, hint = (
-                    field_path((*pattern.place, self._refers)),
-                    suggestion(name, self._known),
-                )
-                message = f"there is no {self._refers} {quoted(name)}{hint}"
+                field = field_path((*pattern.place, self._refers))
+                message = f"there is no {self._refers} {quoted(name)}"
+                message += suggestion(name, self._known)
                 raise InvalidInput.at(field, message, file=pattern.file)
             return entry, ""
         except InvalidInput as error:
