@@ -84,7 +84,8 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
 ) -> None:
     """Run the ROS 2 node that accepts demands.
 
-    Its actions are DeploymentRequest and Demand. Everything after --ros-args goes to ROS.
+    Its actions are DeploymentRequest and Demand. With --clusters, it tells clusters of a push,
+    watches rollouts and takes over nodes. Everything after --ros-args goes to ROS.
     Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
     DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds),
     deployment_request_ids (use, or ignore for clients that number their goals; docs/demand.md),

@@ -157,8 +157,8 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
     version. If a generated file is edited, the command prints the override to write instead. Helm
     lints the charts, and renders them for the current releases and for an example of each
     application. Then the command shows what a merge changes: releases, files and bookkeeping.
-    docs/pull-requests.md describes the check in a pipeline. RULES is a file of rules of the
-    detector, of which only the file is checked.
+    docs/pull-requests.md describes the check in a pipeline; markdown is for a comment on a pull
+    request. RULES is a file of rules of the detector, of which only the file is checked.
 
     \b
     Examples:
