@@ -191,10 +191,11 @@ def test_several_nodes_get_the_types_that_they_have_and_what_they_had_before(
     client.wait(lambda: nodes[0].get_parameter("rate").value == 10.0)
     assert list(nodes[0].get_parameter("ids").value) == []
     client.wait(lambda: state.read_text() == "/second refused its parameters: not yet")
+    client.wait(lambda: sync.log.read_text().count("not yet") == 2)  # once for each change
     is_ready = True
     client.wait(lambda: state.read_text() == "set\n")
     assert nodes[1].get_parameter("rate").value == 10.0
-    assert sync.log.read_text().count("not yet") == 2, "once for each change"
+    assert sync.log.read_text().count("not yet") == 2, "a refusal again is not told"
     # without the memory of the process that set them first
     assert sync.stop(signal.SIGTERM) == 0
     hold(cluster, text="first: {ros__parameters: {ids: [2]}}\nsecond:\n  ros__parameters:\n")
