@@ -210,9 +210,8 @@ class World(MemoryRepo):
             taken = self.take(Demand("expire", demand, demand=demand, is_complete=True))
             assert isinstance(taken, Decision)
             assert taken.files, f"nothing of '{demand}' was released at {now}"
-        for node in self.config.drained_nodes:
-            if self.state.ledger.applications_on.get(node):
-                self.take(Drain(id=node))
+        for node in self.state.nodes_to_drain():
+            self.take(Drain(id=node))
         self.book_waiting()
         return done
 

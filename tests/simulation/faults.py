@@ -208,7 +208,7 @@ FAULTS: dict[str, Fault] = {
             and replace(request, waiting=replace(request.waiting, since=now))),
     "forget_those_that_wait": Fault(7, Agenda, "may_have_room", nothing),
     "let_others_overtake_in_a_batch": Fault(4, Agenda, "book_those_let_in", nothing),
-    "leave_drained_nodes_full": Fault(5, agenda, "_to_drain", lambda *_: []),
+    "leave_drained_nodes_full": Fault(5, World, "nodes_to_drain", lambda *_: []),
     "place_on_drained_nodes": Fault(1, Choice, "_closed", lambda *_: ""),
     "choose_anew_for_a_placed_demand": Fault(7, placement, "_booked", nothing),
     "count_no_room": Fault(7, forbidden, "excesses", lambda *_: []),

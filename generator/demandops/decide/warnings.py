@@ -429,12 +429,11 @@ def policy_warnings(world: State) -> Iterator[Fault]:
                 "to another node"
             )
             yield fault("", message).within(config.file_of(NODES_FILE, id))
-    for id in config.drained_nodes:
-        if world.ledger.applications_on.get(id):
-            drain = with_moves(Drain(id=id), world, world.usage(), world.names())
-            file = config.file_of(NODES_FILE, config.host_of(id))
-            for text in (*drain.moved, *drain.stays):
-                yield fault("", f"'{id}' is drained: {text}").within(file)
+    for id in world.nodes_to_drain():
+        drain = with_moves(Drain(id=id), world, world.usage(), world.names())
+        file = config.file_of(NODES_FILE, config.host_of(id))
+        for text in (*drain.moved, *drain.stays):
+            yield fault("", f"'{id}' is drained: {text}").within(file)
     placed = {  # a shared service is in several definitions, but in one file
         (service.file, service.name): service
         for services in config.services.values()
@@ -445,7 +444,7 @@ def policy_warnings(world: State) -> Iterator[Fault]:
         field = "place" if service.shared else f"services.{name}.place"
         requirement = requirement_of(service)
         problems = [*unmet(requirement, config)]
-        if not problems and all(any(lacks(node, requirement)) for node in config.nodes.values()):
+        if not problems and all(any(lacks(node, requirement)) for node in config.kinds_of_nodes()):
             problems = [f"no node in {config.place_of(NODES_FILE)} meets all requirements"]
         for problem in problems:
             message = f"{problem}, so demands that need '{name}' are refused"

@@ -281,7 +281,8 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
         if node.selector is None or (cluster, domain) not in config.places_of(node):
             continue
         if is_pattern(node.id):
-            written = config.node_patterns[node.id].data["selector"].items()
+            data = config.node_patterns[node.id.partition("@")[0]].data
+            written = data.get("selector", node.selector).items()
             tests = [_has(k, f".matches({_text(f'^{any_value_of(v)}$')})") for k, v in written]
             by_pattern.append(f"({' && '.join(tests) or 'true'})")
         elif len(node.selector) == 1:

@@ -130,7 +130,9 @@ class Agenda:
         for end, name in _ends(state):
             seconds = (end - self._runtime.now()).total_seconds() + 0.01
             own_work = min(own_work, max(seconds, self.waits_s("end", name)))
-        own_work = min([own_work, *(self.waits_s("drain", node) for node in _to_drain(state))])
+        own_work = min(
+            [own_work, *(self.waits_s("drain", node) for node in state.nodes_to_drain())]
+        )
         own_work = min([own_work, *(nodes.due_in(state) for nodes in self.nodes)])
         first = state.ledger.first_to_end()
         if first is not self._first_to_end:  # a search is slow if many leases end at one time
@@ -191,7 +193,7 @@ class Agenda:
         for nodes in self.nodes:
             nodes.commit_due(commits)
         # what runs moves before what waits is booked
-        for node in _to_drain(commits.head.state):
+        for node in commits.head.state.nodes_to_drain():
             if not self.waits_s("drain", node):
                 self._drain(commits, node)
         if self.may_have_room(commits.head.state):
@@ -361,10 +363,6 @@ class Agenda:
 def _ends(world: World) -> list[tuple[datetime, str]]:
     # of the overrides in effect
     return [(override.end, override.name) for override in world.overrides if override.end]
-
-
-def _to_drain(world: World) -> list[str]:
-    return [n for n in world.config.drained_nodes if world.ledger.applications_on.get(n)]
 
 
 # ---- the next attempt to publish: when, and with how many demands ----

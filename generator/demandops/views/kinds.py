@@ -549,7 +549,7 @@ def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
     node, domain = source.config.nodes.get(id), source.config.domain_of.get(id)
     state = "open" if node else "not in the inventory"
     if is_pattern(id):  # it stands for all nodes that it matches
-        node = source.config.node_patterns[id].example
+        node = source.config.kinds[id]
         state, possible = "pattern", source.config.domains_at(node)
         domain = possible[0] if len(possible) == 1 else None
     return {
@@ -558,7 +558,7 @@ def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
         "type": node.type if node else None,
         "cluster": node.cluster if node else None,
         "domain": domain.name if domain else None,
-        "file": source.config.entry_files[NODES_FILE].get(source.config.host_of(id)),
+        "file": source.config.file_of(NODES_FILE, source.config.host_of(id)) if node else None,
         "drained": bool(node and node.drained),
         "capabilities": list(node.capabilities) if node else [],
         "properties": dict(node.properties) if node else {},

@@ -37,6 +37,7 @@ from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
 NODES, BROKERS = "inventory/nodes.yaml", "inventory/brokers.yaml"
+POLICY = "policy/access-domains.yaml"
 PATTERNS = plain_yaml.beside(__file__, "patterns")
 VEHICLE, BROKER = PATTERNS["vehicle"], PATTERNS["broker"]
 
@@ -123,6 +124,17 @@ def test_a_pattern_has_its_namespaces_and_its_part_of_the_rule_of_its_cluster() 
     ((cluster, domain),) = gitops.domains_in_use(config)
     rule = gitops.node_rule(cluster, domain, config)
     assert '("vin" in variables.selector && variables.selector["vin"].matches("^b\\\\.[A-Z' in rule
+    further = {
+        "id": "tram{n}",
+        "type": "tram",
+        "cluster": "c-its",
+        "accessDomains": [{"name": "b"}],
+    }
+    policy = yaml.safe_load(skeleton()[POLICY])
+    policy["domains"].append({"name": "b", "namespace": "b", "nodes": [], "ros": {"domainId": 7}})
+    config = load(configuration(inventory(further) | {POLICY: json.dumps(policy)}))
+    ((cluster, domain), _) = gitops.domains_in_use(config)
+    assert '["node_id"].matches("^tram[A-Z' in gitops.node_rule(cluster, domain, config)
 
 
 def test_a_node_of_many_patterns_is_found_among_few() -> None:

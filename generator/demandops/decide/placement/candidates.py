@@ -231,12 +231,17 @@ class Choice:
         more = required.labels or required.properties
         return [  # there may be thousands, so what is cheap to see comes first
             node
-            for node in pool
+            for node in (*self._unlisted_home(), *pool)
             if not self._closed(node)
             and (not role or node.type == role)
             and not wanted.difference(node.capabilities)
             and not (more and any(lacks(node, required)))
         ]
+
+    def _unlisted_home(self) -> list[Node]:
+        # of nodes that nobody listed, only the application's own may have one of its services
+        home = self.config.nodes.get(self.app.node) if self.service else None
+        return [home] if home and home.id not in self.config.kinds else []
 
     def _rank(self) -> Callable[[Node], tuple[bool, float, float, str]]:
         positions, order = self.positions, self.config.repo_settings.placement
@@ -284,7 +289,8 @@ class Choice:
         rank, codes = self._rank(), set[str]()
         misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
         places = {self.config.place_of(NODES_FILE): None}
-        for node in self.config.nodes_by_role.get(self.requirement.role, ()):
+        listed = self.config.nodes_by_role.get(self.requirement.role, ())
+        for node in (*self._unlisted_home(), *listed):
             missing = list(lacks(node, self.requirement))
             reasons = [f"lacks {joined(missing)}"] if missing else []
             reasons += filter(None, [self._closed(node)])
@@ -307,7 +313,10 @@ class Choice:
         shown = [text for *_, text in nsmallest(_MOST_SHOWN, misses)]
         hidden = len(misses) - len(shown)
         more = [f"{hidden} more {'are' if hidden > 1 else 'is'} not shown"] if hidden else []
-        message = f"{what}no node fits: {'; '.join([*shown, *more]) or 'the inventory has no node'}"
+        nothing = "the inventory lists none" + bool(self.config.node_patterns) * (
+            ", and one of a pattern is used only where a demand names it"
+        )
+        message = f"{what}no node fits: {'; '.join([*shown, *more]) or nothing}"
         less = f"change 'place' in {self.service.file}" if self.service else "ask for less"
         message += f"; {less}, or ask for a change of {' or '.join(places)}"
         code = NO_ROOM if codes == {NO_ROOM} else "no-node"
@@ -316,7 +325,7 @@ class Choice:
 
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
     """Yield a message for each part of a requirement that no node of the inventory can meet."""
-    role, roles = requirement.role, config.nodes_by_role.keys() - {""}
+    role, roles = requirement.role, {node.type for node in config.kinds_of_nodes()}
     if role and role not in roles:
         yield f"no node has the role {quoted(role)}{suggestion(role, roles)}"
     kinds = config.property_kinds

@@ -106,6 +106,8 @@ class Config:
     entry_files: Mapping[str, Mapping[str, str]] = field(
         default_factory=dict, compare=False, repr=False
     )
+    # Each listed node, and those that stand for all nodes of a pattern, by the id as it is written
+    kinds: Mapping[str, Node] = field(init=False, compare=False, repr=False)
     # For each role, the nodes with this `type`, sorted by id. The empty role has all nodes.
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
     # For each `(capability,)` or `(label key, value)`, the nodes with it, sorted by id
@@ -125,8 +127,11 @@ class Config:
     )
 
     def __post_init__(self) -> None:
+        examples = [pattern.example for pattern in self.node_patterns.values()]
+        examples += [each.in_domain(at) for each in examples for at in each.access_domains]
+        kinds_by_id = {**self.nodes, **{node.id: node for node in examples}}
         by_kind: dict[str, dict[Kind, list[str]]] = {}
-        for node in self.kinds_of_nodes():
+        for node in kinds_by_id.values():
             for name, value in node.properties.items():
                 ids_by_kind = by_kind.setdefault(name, {})
                 ids_by_kind.setdefault(kind_of(value) or "text", []).append(node.id)
@@ -143,11 +148,12 @@ class Config:
                 by_trait.setdefault(trait, []).append(node)
         services = [s for services in self.services.values() for s in services.values()]
         indexes = {
+            "kinds": kinds_by_id,
             "nodes_by_role": {role: tuple(nodes) for role, nodes in by_role.items()},
             "nodes_with": {trait: tuple(nodes) for trait, nodes in by_trait.items()},
             "property_kinds": {name: (kind, ids[0]) for name, (kind, ids) in kinds.items()},
             "drained_nodes": tuple(sorted(id for id, node in self.nodes.items() if node.drained)),
-            "limits_capacity": any(node.capacity is not None for node in self.kinds_of_nodes()),
+            "limits_capacity": any(node.capacity is not None for node in kinds_by_id.values()),
             "roles_with_services": tuple(sorted({s.root for s in services if s.root})),
             "application_versions": {name: self._versions(name) for name in self.services},
         }
@@ -173,16 +179,15 @@ class Config:
         channels = {"": listed.default, **listed.channels}
         return versions | {channel: versions[name] for channel, name in channels.items()}
 
-    def kinds_of_nodes(self) -> Iterator[Node]:
-        """Yield each listed node, and for each pattern one that stands for all its nodes."""
-        yield from self.nodes.values()
-        yield from (pattern.example for pattern in self.node_patterns.values())
+    def kinds_of_nodes(self) -> Iterable[Node]:
+        """Return each listed node, and those that stand for all nodes of each pattern."""
+        return self.kinds.values()
 
     def has_node(self, pattern: str) -> bool:
         """Return whether a node has this name, or may match this pattern with ``*`` and ``?``."""
         if "*" in pattern or "?" in pattern:
-            return may_match(pattern, (*self.nodes, *self.node_patterns))
-        return pattern in self.nodes or pattern in self.node_patterns
+            return may_match(pattern, self.kinds)
+        return pattern in self.nodes or pattern in self.kinds
 
     def example_nodes(self) -> Iterator[str]:
         """Yield for each pattern an id of a node in an access domain, as far as it is found."""
@@ -191,9 +196,17 @@ class Config:
 
     def places_of(self, node: Node) -> list[tuple[str, AccessDomain]]:
         """Return a node's cluster and access domain, or each that nodes of a pattern may have."""
-        if is_pattern(node.id):
-            return [*self.unlisted.places(node.id, node.cluster, self.clusters)]
-        return [(node.cluster, self.domain_of[node.id])] if node.id in self.domain_of else []
+        if not is_pattern(node.id):
+            return [(node.cluster, self.domain_of[node.id])] if node.id in self.domain_of else []
+        host, _, name = node.id.partition("@")  # as written: `vehicle{n}@{area}`
+        example, places = self.node_patterns[host].example, []
+        for there, first in self.unlisted.places(example, self.clusters):
+            pairs = zip(example.access_domains, there.access_domains, strict=True)
+            named = {written.name: self.domains.get(at.name) for written, at in pairs}
+            domain = named[name] if name else first
+            if domain and (domain is not first or not name):
+                places.append((there.cluster, domain))
+        return places
 
     def domains_at(self, node: Node) -> list[AccessDomain]:
         return [*{domain.name: domain for _, domain in self.places_of(node)}.values()]
@@ -210,7 +223,9 @@ class Config:
 
     def file_of(self, collection: str, name: str) -> str:
         # for an unknown entry, the collection's usual file
-        return self.entry_files.get(collection, {}).get(name, collection)
+        made_by = self.unlisted.patterns.matching(name) if collection == NODES_FILE else []
+        usual = made_by[0].file if made_by else collection
+        return self.entry_files.get(collection, {}).get(name, usual)
 
     def place_of(self, collection: str) -> str:
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
@@ -252,6 +267,8 @@ class ConfigReader:
         self.patterns = defaultdict[str, list[EntryPattern[Any]]](list)
         # The valid files with items, but without the items
         self.heads: dict[str, BaseModel] = {}
+        # By collection: why an id that a pattern matches is no entry, or nothing
+        self.why_not = defaultdict[str, Callable[[str], str]](lambda: lambda name: "")
 
     def add_fault(self, file: str, field: str, message: str) -> None:
         self._counts[file] += 1
@@ -359,6 +376,8 @@ class ConfigReader:
             if name in self.places[collection]:
                 message = f"'{name}' is a pattern; name one that it matches"
             self.add_fault(file, field, message)
+        elif name not in self.places[collection] and (why := self.why_not[collection](name)):
+            self.add_fault(file, field, f"'{name}' {why}")
 
     def _valid(
         self,

@@ -42,6 +42,8 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(file, f"{place}.id", message)
         named = [("cluster", node.cluster, configs.CLUSTERS_FILE)]
         named += [(f"bridged.{peer}", peer, configs.NODES_FILE) for peer in node.bridged]
+        further = enumerate(node.access_domains)
+        named += [(f"accessDomains[{n}].name", at.name, configs.DOMAINS_FILE) for n, at in further]
         for field, name, collection in named:
             reader.check_reference(file, f"{place}.{field}", name, collection, node.id)
         for name, value in node.properties.items():

@@ -19,7 +19,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from demandops.base.errors import InvalidInput, fault, field_path, suggestion
+from demandops.base.errors import InvalidInput, fault, field_path
 from demandops.base.naming import MAX_ID
 from demandops.base.placeholders import (
     example_of,
@@ -163,8 +163,11 @@ class EntryPattern(Generic[Entry]):
     def example(self) -> Entry:
         """The entry of an id that matches, but with the pattern as its id; may be invalid."""
         in_id, where = names(self.id), field_path(self.place)
-        if len(in_id) > _MOST_PLACEHOLDERS or "id" in in_id:
+        of_domain = self.model is Node and "@" in self.id
+        if len(in_id) > _MOST_PLACEHOLDERS or "id" in in_id or of_domain:
             message = f"has {len(in_id)} placeholders; write at most three"
+            if of_domain:
+                message = "has an '@', which is between a node and its further domain; leave it out"
             if "id" in in_id:
                 meant = quoted(self.id.replace("{id}", "{n}"))
                 message = f"{{id}} stands for the whole id; write another name, such as {meant}"
@@ -215,18 +218,16 @@ def _read_number(
 class EntryPatterns(Generic[Entry]):
     """The patterns of one kind of entry; ``find`` gives an id's entry, or why it has none.
 
-    The field ``refers`` of an entry names one of ``known``.
+    ``problems`` says what other files make of an entry: fields, each with what is wrong there.
     """
 
     def __init__(
         self,
         word: str,
-        patterns: Iterable[EntryPattern[Entry]] = (),
-        refers: str = "",
-        known: Mapping[str, Any] = MappingProxyType({}),
+        patterns: Iterable[EntryPattern[Entry]],
+        problems: Callable[[Entry], Iterable[tuple[str, str]]],
     ) -> None:
-        self._word, self._patterns = word, tuple(patterns)
-        self._refers, self._known = refers, known
+        self._word, self._patterns, self._problems = word, tuple(patterns), problems
         self._globs = Globs((pattern.glob, pattern) for pattern in self._patterns)
         self.find = lru_cache(maxsize=65_536)(self._find)
 
@@ -239,10 +240,13 @@ class EntryPatterns(Generic[Entry]):
     def candidates(self, id: str) -> Iterator[EntryPattern[Entry]]:
         return (pattern for _, pattern in self._globs.matching(id))
 
-    def _find(self, id: str) -> tuple[Entry | None, str]:
+    def matching(self, id: str) -> list[EntryPattern[Entry]]:
         if len(id) > MAX_ID:  # this is refused, but only after it was looked for
-            return None, ""
-        patterns = [pattern for pattern in self.candidates(id) if pattern.values(id)]
+            return []
+        return [pattern for pattern in self.candidates(id) if pattern.values(id)]
+
+    def _find(self, id: str) -> tuple[Entry | None, str]:
+        patterns = self.matching(id)
         if len(patterns) > 1:
             named = " and ".join(f"{quoted(each.id)} in {each.where}" for each in patterns[:2])
             return None, f"matches {named}; narrow one of these patterns"
@@ -250,12 +254,9 @@ class EntryPatterns(Generic[Entry]):
             return None, ""
         (pattern,) = patterns
         try:
-            entry = pattern.entry(id)
-            if (name := getattr(entry, self._refers)) not in self._known:
-                field = field_path((*pattern.place, self._refers))
-                message = f"there is no {self._refers} {quoted(name)}"
-                message += suggestion(name, self._known)
-                raise InvalidInput.at(field, message, file=pattern.file)
+            entry, place = pattern.entry(id), field_path(pattern.place)
+            for field, problem in self._problems(entry):
+                raise InvalidInput.at(f"{place}.{field}", problem, file=pattern.file)
             return entry, ""
         except InvalidInput as error:
             named = quoted(pattern.id)
@@ -329,27 +330,38 @@ class UnlistedNodes:
         """Return why an id that a pattern matches is no node, or in no domain, else nothing."""
         return self._made(id)[2]
 
-    def possible_domains(self, pattern: str) -> list[AccessDomain]:
-        names = {name for _, name in self._globs.overlapping(glob_of(pattern))}
-        return [self._domains[name] for name in sorted(names)]
+    def places(self, node: Node, clusters: Iterable[str]) -> Iterator[tuple[Node, AccessDomain]]:
+        """Yield what the example of a pattern stands for, with each domain of those nodes.
 
-    def places(
-        self, pattern: str, text: str, names: Iterable[str]
-    ) -> Iterator[tuple[str, AccessDomain]]:
-        """Yield each of ``names`` that ``text`` may name, with each domain of those nodes."""
-        for name in names if is_pattern(text) else (text,):
-            if (values := values_in(text, name)) is not None:
-                for domain in self.possible_domains(filled(pattern, values)):
-                    yield name, domain
+        Its placeholders have values that name a cluster and further domains; others give no node.
+        """
+        possible = list[dict[str, str]]([{}])
+        asked = [(at.name, self._domains) for at in node.access_domains]
+        for text, those in ((node.cluster, clusters), *asked):
+            found = (
+                (known, values_in(filled(text, known), name))
+                for known in possible
+                for name in (those if is_pattern(text) else (text,))
+            )
+            possible = [known | more for known, more in found if more is not None]
+        for known in possible:
+            further = [
+                at.model_copy(update={"name": filled(at.name, known)}) for at in node.access_domains
+            ]
+            there = {"cluster": filled(node.cluster, known), "access_domains": further}
+            id = filled(node.id, known)
+            for name in sorted({name for _, name in self._globs.overlapping(glob_of(id))}):
+                yield node.model_copy(update=there), self._domains[name]
+
+    def first_domain(self, id: str) -> AccessDomain | None:
+        names = {name for _, name in self._globs.matching(id)}
+        return self._domains[names.pop()] if len(names) == 1 else None
 
     def _made(self, id: str) -> tuple[Node | None, AccessDomain | None, str]:
         node, problem = self.patterns.find(id)
         if node is None:
             return None, None, problem
-        if problem := self.of_several_domains(id):
-            return node, None, problem
-        name = next((name for _, name in self._globs.matching(id)), None)
-        return node, self._domains[name] if name is not None else None, ""
+        return node, self.first_domain(id), self.of_several_domains(id)
 
     def of_several_domains(self, id: str) -> str:
         """Return which access domains match an id, if these are several; then it is in none."""
@@ -360,5 +372,5 @@ class UnlistedNodes:
         return f"is in the access domains {named}; narrow these patterns"
 
 
-NO_BROKER_PATTERNS = EntryPatterns[Any]("broker")
-NOTHING_UNLISTED = UnlistedNodes(EntryPatterns("node"), {}, lambda node, _: node)
+NO_BROKER_PATTERNS = EntryPatterns[Any]("broker", (), lambda _: ())
+NOTHING_UNLISTED = UnlistedNodes(EntryPatterns("node", (), lambda _: ()), {}, lambda node, _: node)

@@ -7,13 +7,13 @@ every fault of every file.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-from demandops.base.placeholders import filled, values_in
+from demandops.base.errors import suggestion
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION, RENDER_VERSION
 from demandops.model.config import config as configs
@@ -77,19 +77,34 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         configs.DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name"
     )
     settings = repository or _ANY
-    for id, node in nodes.items():
+    examples = {each.id: each.example for each in reader.patterns[configs.NODES_FILE]}
+    for id, node in (nodes | examples).items():
         file, place = reader.places[configs.NODES_FILE][id]
         if node.capacity is not None:
             named = _with_short_names(node.capacity, settings, reader, file, f"{place}.capacity")
-            nodes[id] = node.model_copy(update={"capacity": named})
+            if id in nodes:
+                nodes[id] = node.model_copy(update={"capacity": named})
 
     def completed(node: Node, domain: AccessDomain | None) -> Node:
         node = _in_ros_domain(node, domain)
         capacity = settings.with_short_names(node.capacity) if node.capacity else node.capacity
         return node.model_copy(update={"capacity": capacity})
 
-    node_patterns = EntryPatterns("node", reader.patterns[configs.NODES_FILE], "cluster", clusters)
+    def problems(node: Node) -> Iterator[tuple[str, str]]:
+        # what nobody sees before the id is known
+        further = [(f"accessDomains[{i}].name", at) for i, at in enumerate(node.access_domains)]
+        asked: list[tuple[str, str, str, Mapping[str, Any]]]
+        asked = [("cluster", "cluster", node.cluster, clusters)]
+        asked += [(field, "access domain", at.name, domains) for field, at in further]
+        for field, what, name, known in asked:
+            if name not in known:
+                yield field, f"there is no {what} {quoted(name)}{suggestion(name, known)}"
+        if first := unlisted.first_domain(node.id):
+            yield from _clashes(reader, node, first, domains)
+
+    node_patterns = EntryPatterns("node", reader.patterns[configs.NODES_FILE], problems)
     unlisted = UnlistedNodes(node_patterns, domains, completed)
+    reader.why_not[configs.NODES_FILE] = unlisted.why_not
     clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of[configs.CLIENTS_FILE]:
         part = reader.read_file(file, registry.ClientsFile)
@@ -102,25 +117,13 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
     for pattern in node_patterns:
-        node = pattern.example
-        # the values of placeholders that clusters and domains have; others give no node
-        asked: list[tuple[str, Mapping[str, Any]]] = [(node.cluster, clusters)]
-        asked += [(at.name, domains) for at in node.access_domains]
-        possible = list[dict[str, str]]([{}])
-        for text, names in asked if node.access_domains else ():
-            found = (
-                (known, values_in(filled(text, known), each))
-                for known in possible
-                for each in names
-            )
-            possible = [known | more for known, more in found if more is not None] or possible
-        for known in possible:
-            further = [
-                at.model_copy(update={"name": filled(at.name, known)}) for at in node.access_domains
-            ]
-            one = node.model_copy(update={"access_domains": further})
-            for domain in unlisted.possible_domains(filled(pattern.id, known)):
-                _in_further_domains(reader, {node.id: one}, domains, {node.id: domain})
+        node, at = pattern.example, reader.places[configs.NODES_FILE][pattern.id]
+        for further in node.access_domains:
+            reader.places[configs.NODES_FILE][id_in_domain(node.id, further.name)] = at
+        places = unlisted.places(node, clusters)
+        clashes = [[*_clashes(reader, *place, domains)] for place in places]
+        for field, message in min(clashes, key=len, default=()):  # some id may have none
+            reader.add_fault(at[0], f"{at[1]}.{field}", message)
     all_nodes = {id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()}
     if node_patterns:
         all_nodes = OnDemand(all_nodes, lambda id: (made := unlisted.find(id)) and made.node)
@@ -133,9 +136,15 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     brokers = reader.read_items(
         configs.BROKERS_FILE, inventory.BrokersFile, "brokers", inventory.Broker, "node"
     )
+
+    def problems_of_broker(broker: inventory.Broker) -> Iterator[tuple[str, str]]:
+        if (name := broker.node) not in all_nodes:
+            yield "node", f"there is no node {quoted(name)}{suggestion(name, all_nodes)}"
+
     broker_patterns = EntryPatterns(
-        "broker", reader.patterns[configs.BROKERS_FILE], "node", all_nodes
+        "broker", reader.patterns[configs.BROKERS_FILE], problems_of_broker
     )
+    reader.why_not[configs.BROKERS_FILE] = lambda node: broker_patterns.find(node)[1]
     if broker_patterns:
         brokers = OnDemand(brokers, lambda node: broker_patterns.find(node)[0])
     charts = reader.read_items(configs.CHARTS_FILE, registry.ChartsFile, "charts", registry.Chart)
@@ -303,39 +312,48 @@ def _in_further_domains(
     for node in [node for node in nodes.values() if node.access_domains]:  # `nodes` grows
         file, place = reader.places[configs.NODES_FILE][node.id]
         first = domain_of.get(node.id)
-        ros = {_in_ros_domain(node, first).ros.domain_id: first.name} if first else {}
+        if first is None:
+            # the node may be in an invalid domain, or in several, which has a fault of its own
+            is_matched = any(matches(node.id, d.nodes) for d in domains.values())
+            if not is_matched and configs.DOMAINS_FILE not in reader.incomplete:
+                message = f"no access domain has '{node.id}' in its nodes; add it to one"
+                reader.add_fault(file, f"{place}.accessDomains[0]", message)
+            continue
+        for field, message in _clashes(reader, node, first, domains):
+            reader.add_fault(file, f"{place}.{field}", message)
         for index, further in enumerate(node.access_domains):
-            where, id = f"{place}.accessDomains[{index}]", id_in_domain(node.id, further.name)
-            domain = domains.get(further.name)
-            reader.check_reference(
-                file, f"{where}.name", further.name, configs.DOMAINS_FILE, node.id
-            )
-            if first is None:
-                # the node may be in an invalid domain, or in several, which has a fault of its own
-                is_matched = any(matches(node.id, d.nodes) for d in domains.values())
-                if not is_matched and configs.DOMAINS_FILE not in reader.incomplete:
-                    message = f"no access domain has '{node.id}' in its nodes; add it to one"
-                    reader.add_fault(file, where, message)
-            elif domain is first or id in nodes:
-                message = f"'{node.id}' is already in '{further.name}'; remove this entry"
-                if domain is not first and id not in hosts:
-                    message = f"a node of the inventory has the id '{id}'; rename that node"
-                reader.add_fault(file, f"{where}.name", message)
+            id, domain = id_in_domain(node.id, further.name), domains.get(further.name)
+            if id in nodes and id not in hosts:
+                message = f"a node of the inventory has the id '{id}'; rename that node"
+                reader.add_fault(file, f"{place}.accessDomains[{index}].name", message)
             elif domain is not None:
-                number = _in_ros_domain(node, domain).ros.domain_id
-                other = ros.setdefault(number, domain.name)
-                if other != domain.name:
-                    message = (
-                        f"access domains '{other}' and '{domain.name}' share ROS domain {number}, "
-                        f"so each would read the other's topics on '{node.id}'; give one of them "
-                        "'ros: {domainId: …}' in "
-                        + reader.places[configs.DOMAINS_FILE][domain.name][0]
-                    )
-                    reader.add_fault(file, f"{where}.name", message)
                 # the first domain keeps the plain name, so a further one changes nothing that runs
                 nodes[id], domain_of[id], hosts[id] = node.in_domain(further), domain, node.id
                 reader.places[configs.NODES_FILE][id] = (file, place)
     return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
+
+
+def _clashes(
+    reader: ConfigReader, node: Node, first: AccessDomain, domains: Mapping[str, AccessDomain]
+) -> Iterator[tuple[str, str]]:
+    """Yield each further domain of a node that is no other than those before it, by its field."""
+    names, numbers = {first.name}, {_in_ros_domain(node, first).ros.domain_id: first.name}
+    for index, further in enumerate(node.access_domains):
+        field, domain = f"accessDomains[{index}].name", domains.get(further.name)
+        if domain is None:
+            continue
+        number = _in_ros_domain(node, domain).ros.domain_id
+        other = numbers.setdefault(number, domain.name)
+        if domain.name in names:
+            yield field, f"'{node.id}' is already in '{domain.name}'; remove this entry"
+        elif other != domain.name:
+            message = (
+                f"access domains '{other}' and '{domain.name}' share ROS domain {number}, so each "
+                f"would read the other's topics on '{node.id}'; give one of them "
+                "'ros: {domainId: …}' in " + reader.places[configs.DOMAINS_FILE][domain.name][0]
+            )
+            yield field, message
+        names.add(domain.name)
 
 
 # How many of the domains that match one node a message names

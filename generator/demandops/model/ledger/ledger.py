@@ -307,3 +307,12 @@ class World:
         # the last one wins
         by_rank = sorted(active, key=lambda override: (override.priority, override.name))
         object.__setattr__(self, "overrides", tuple(by_rank))
+
+    def nodes_to_drain(self) -> list[str]:
+        """Return the drained nodes with applications or services that were placed there."""
+        config, used = self.config, self.ledger.applications_on
+        drained: Iterable[str] = config.drained_nodes
+        if any(pattern.example.drained for pattern in config.node_patterns.values()):
+            nodes = ((id, config.nodes.get(id)) for id in sorted(used))
+            drained = [id for id, node in nodes if node and node.drained]
+        return [id for id in drained if id in used]
