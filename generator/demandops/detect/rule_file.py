@@ -447,7 +447,7 @@ def read(text: str, file: str) -> RuleFile:
 
 def _faults(rules: RuleFile) -> Iterator[Fault]:
     names: set[str] = set()
-    ids: list[tuple[str, Rule]] = []
+    identities: list[tuple[Any, Rule]] = []
     for name, listed in rules.sources.items():
         place, frame = listed.position, rules.map
         if place and place.in_degrees and not (frame and frame.on_earth):
@@ -478,23 +478,25 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
                 )
                 yield fault(f"{where}.{kind}.{part}", message)
         field = "demand" if rule.demand is not None else "deploymentRequest"
-        yield from faults_of_demand(
+        if problems := faults_of_demand(
             rule.template, f"{where}.{field}", rule.subjects, rule.momentary
-        )
-        if rule.demand is not None:
-            id = str(rule.demand.get("demand", "")).replace("{rule}", rule.name)
-            for other_id, other in ids:
-                # Two rules may have an event for one entity at the same time if they have a pattern
-                # in common, or if one of them has ``*``. Different patterns that match the same
-                # entity, such as ``car*`` and ``*1``, are not recognized.
-                own, others = {*rule.entities}, {*other.entities}
-                may_meet = "*" in own | others or not own.isdisjoint(others)
-                if id == other_id and may_meet:
-                    message = (
-                        f"is also the id of a demand of rule '{other.name}', so the event that "
-                        "ends first would end the other event's demand; add {rule} to one of the "
-                        "ids"
-                    )
-                    yield fault(f"{where}.demand.demand", message)
-                    break
-            ids.append((id, rule))
+        ):
+            yield from problems
+            continue
+        # what ends an event's demand; a shutdown also ends only what the same requesters joined
+        goal = rule.template.filled({"rule": rule.name})
+        identity = (goal.action, goal.id, goal.requesters if rule.demand is None else ())
+        for other_identity, other in identities:
+            # Two rules may have an event for one entity at the same time if they have a pattern in
+            # common, or if one of them has ``*``. Different patterns that match the same entity,
+            # such as ``car*`` and ``*1``, are not recognized.
+            own, others = {*rule.entities}, {*other.entities}
+            may_meet = "*" in own | others or not own.isdisjoint(others)
+            if identity == other_identity and may_meet:
+                message = (
+                    f"is also the id of a demand of rule '{other.name}', so the event that ends "
+                    "first would end the other event's demand; add {rule} to one of the ids"
+                )
+                yield fault(f"{where}.{field}.{'demand' if rule.demand else 'id'}", message)
+                break
+        identities.append((identity, rule))
