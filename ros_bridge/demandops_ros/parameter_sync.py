@@ -60,7 +60,8 @@ def parameters_of(node: str, text: str, file: str) -> dict[str, Any]:
 
 # ---- the parameters of another node, set again after that node restarts ----
 #
-# A restarted node publishes its parameter events at a new endpoint, which the ROS graph shows.
+# A restarted node publishes its parameter events or its log at a new endpoint, which the ROS graph
+# shows.
 
 _KINDS = Parameter.Type
 _INTEGERS = {_KINDS.INTEGER, _KINDS.INTEGER_ARRAY}
@@ -149,11 +150,13 @@ class ParameterSetter:
     def _set_if_needed(self) -> None:
         # A restarted target has new endpoints. The ROS graph may still list the endpoint of one
         # that was killed, so all of them are compared.
-        endpoints = frozenset(
-            tuple(info.endpoint_gid)
-            for info in self._node.get_publishers_info_by_topic("/parameter_events")
-            if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._target
-        )
+        endpoints = frozenset[Any]()
+        for topic in ("/parameter_events", "/rosout"):  # a node may publish only one of them
+            endpoints = endpoints or frozenset(
+                tuple(info.endpoint_gid)
+                for info in self._node.get_publishers_info_by_topic(topic)
+                if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._target
+            )
         with self._lock:
             wanted, version = self._wanted, self._version
         now, is_answered = REAL.monotonic(), self._answered == (endpoints, version)

@@ -267,7 +267,7 @@ def _read_package(name: str, folder: Path, known: Mapping[str, Path]) -> Package
     used = set[tuple[str, str]]()
     for path in folder.glob("msg/**/*.msg"):
         place = path.relative_to(folder)
-        if not re.fullmatch(r"msg(/[A-Za-z0-9_]+)*/[A-Z][A-Za-z0-9]*\.msg", str(place)):
+        if not re.fullmatch(r"msg(/[A-Za-z0-9_-]+)*/[A-Z][A-Za-z0-9]*\.msg", str(place)):
             raise Refused(f"{path}: is no name of a message; write it like msg/EgoData.msg")
         if not path.is_file():
             raise Refused(f"{path}: leads to no file; remove the link, or mend it")

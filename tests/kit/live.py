@@ -67,7 +67,7 @@ def main(bag: str) -> None:
 
     types = get_typestore(Stores.ROS2_KILTED)
     for package, folder in {"fleet_msgs": "fleet_msgs", "hazard_msgs": "warnings"}.items():
-        for path in (DEFINITIONS / folder / "msg").iterdir():
+        for path in (DEFINITIONS / folder).rglob("*.msg"):
             types.register(get_types_from_msg(path.read_text(), f"{package}/msg/{path.stem}"))
     steps: list[Step] = json.load(sys.stdin)
     rclpy.init()

@@ -170,7 +170,8 @@ def test_several_nodes_get_the_types_that_they_have_and_what_they_had_before(
     cluster: KubeApi, servers: Servers, client: Client, tmp_path: Path
 ) -> None:
     free = {"context": client.node.context, "allow_undeclared_parameters": True}
-    nodes = [Node(name, **free) for name in ("first", "second")]
+    elsewhere = ["--ros-args", "-r", "/parameter_events:=/elsewhere"]
+    nodes = [Node("first", **free), Node("second", **free, cli_args=elsewhere)]
     for node in nodes:
         client.executor.add_node(node)
         node.declare_parameter("rate", 0.5)

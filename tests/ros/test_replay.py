@@ -83,7 +83,7 @@ def test_a_bag_gives_the_demands_of_its_poses(demandops: Run, tmp_path: Path) ->
 
 EGO = "perception_msgs/msg/EgoData"
 EGO_FIELDS = "std_msgs/Header header\nperception_msgs/ObjectState state\n"
-STATE_FIELDS = "string model\nfloat64[] continuous_state\n"
+STATE_FIELDS = "string model\nfloat64[] continuous_state\nbyte kind\n"
 
 
 def test_a_bag_is_read_with_the_message_definitions_that_it_contains(
@@ -95,14 +95,19 @@ def test_a_bag_is_read_with_the_message_definitions_that_it_contains(
     types.register(get_types_from_msg(EGO_FIELDS, EGO))
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
         topic = writer.add_connection("/vehicles/vehicle01/pose", EGO, typestore=types)
-        for tick, away in enumerate((100.0, 80.0, 89.0, 95.0)):
+        odd = {"msgdef": "no $$ definition\n", "rihs01": "RIHS01_" + "0" * 64}
+        writer.add_connection("/odd", "odd_msgs/msg/Odd", **odd)  # that no rule reads
+        # the last message says, by the byte 200, that its position is not known
+        for tick, away in enumerate((100.0, 80.0, 89.0, 95.0, 80.0)):
             place = numpy.array([STATION[0] + away, STATION[1], 0.0])
-            state = types.types["perception_msgs/msg/ObjectState"]("ego", place)
+            kind = 200 - 256 if tick == 4 else 0
+            state = types.types["perception_msgs/msg/ObjectState"]("ego", place, kind)
             stamp = types.types["builtin_interfaces/msg/Time"](0, 0)
             ego = types.types[EGO](types.types["std_msgs/msg/Header"](stamp, "map"), state)
             writer.write(topic, (START_S + tick) * 10**9, types.serialize_cdr(ego, EGO))
     rules = tmp_path / "rules.yaml"
-    rules.write_text(RULES.read_text().replace(POSE, EGO))
+    source = f"type: {EGO}\n    unavailable: {{state.kind: 200}}"
+    rules.write_text(RULES.read_text().replace(f"type: {POSE}", source))
     ran = demandops("detect", rules, "--replay", tmp_path / "bag", "--output", "json")
     told = [(one["second"], one["entities"], one["change"]) for one in ran.json()["events"]]
     assert told == [(1.0, ["vehicle01"], "start"), (3.0, ["vehicle01"], "stop")]

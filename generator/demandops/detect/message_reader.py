@@ -134,8 +134,8 @@ class MessageReader:
         self._frames, self._timeout_s = frames, seconds_of(definition.timeout)
         self._frame = self._place and self._place.frame and _getter(self._place.frame)
         self._height = self._place and self._place.z and _getter(self._place.z)
-        unavailable = self._place.unavailable if self._place else definition.unavailable
-        self._unavailable = [(_getter(field), number) for field, number in unavailable.items()]
+        silence = definition.silence.items()
+        self._unavailable = [(_getter(field), numbers) for field, numbers in silence]
         thresholds = (rule.threshold for rule in file.rules)
         fields = {limits.field for limits in thresholds if limits and limits.source == source}
         self._fields = {field: _getter(field) for field in sorted(fields)}
@@ -150,8 +150,8 @@ class MessageReader:
 
         ``entity`` is from the topic, empty if a field has it.
         """
-        for get, number in self._unavailable:
-            if _number(get(message)) == number:
+        for get, numbers in self._unavailable:
+            if _number(get(message)) in numbers:
                 return None
         if self._entity:
             entity = str(self._entity(message)).strip("/")

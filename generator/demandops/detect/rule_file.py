@@ -215,7 +215,7 @@ def _faults_of_ids(template: Goal, field: str, needed: set[str]) -> Iterator[Fau
 class PositionFields(NamedTuple):
     """The two fields of a message with a position: x and y in metres, or degrees.
 
-    Degrees, latitude first, are multiplied by ``scale``. If a field has the value that
+    Degrees, latitude first, are multiplied by ``scale``. If a field has one of the values that
     ``unavailable`` gives it, the message says that the position is not known. Metres may be in the
     frame that the field ``frame`` names, with the height ``z``.
     """
@@ -223,7 +223,7 @@ class PositionFields(NamedTuple):
     first: str
     second: str
     scale: float = 0.0
-    unavailable: Mapping[str, float] = MappingProxyType({})
+    unavailable: Mapping[str, Sequence[float]] = MappingProxyType({})
     z: str = ""
     frame: str = ""
 
@@ -237,10 +237,18 @@ def _in_metres(point: str) -> PositionFields:
 
 
 _ETSI = "cam.cam_parameters.basic_container.reference_position"
+# in units of 0.1 microdegree, with a number of its own for a position that is not known
+_CAM = PositionFields(
+    f"{_ETSI}.latitude.value",
+    f"{_ETSI}.longitude.value",
+    1e-7,
+    {f"{_ETSI}.latitude.value": (900_000_001,), f"{_ETSI}.longitude.value": (1_800_000_001,)},
+)
 
 # For some message types, the fields that have the position; a source can name other fields.
 POSITIONS: Mapping[str, PositionFields] = {
     "geometry_msgs/msg/PoseStamped": _in_metres("pose.position"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _in_metres("pose.pose.position"),
     "nav_msgs/msg/Odometry": _in_metres("pose.pose.position"),
     "perception_msgs/msg/EgoData": PositionFields(
         "state.continuous_state[0]",
@@ -248,16 +256,12 @@ POSITIONS: Mapping[str, PositionFields] = {
         z="state.continuous_state[2]",
         frame="header.frame_id",
     ),
+    # without a fix, or not known whether there is one
     "sensor_msgs/msg/NavSatFix": PositionFields(
-        "latitude", "longitude", 1.0, {"status.status": -1}
+        "latitude", "longitude", 1.0, {"status.status": (-1, -2)}
     ),
-    # in units of 0.1 microdegree, with a number of its own for a position that is not known
-    "etsi_its_cam_msgs/msg/CAM": PositionFields(
-        f"{_ETSI}.latitude.value",
-        f"{_ETSI}.longitude.value",
-        1e-7,
-        {f"{_ETSI}.latitude.value": 900_000_001, f"{_ETSI}.longitude.value": 1_800_000_001},
-    ),
+    "etsi_its_cam_msgs/msg/CAM": _CAM,
+    "etsi_its_cam_ts_msgs/msg/CAM": _CAM,
 }
 
 
@@ -311,8 +315,7 @@ class Source(CamelModel):
     @property
     def position(self) -> PositionFields | None:
         if self.latitude and self.longitude:
-            scale = self.scale or 1.0
-            return PositionFields(self.latitude, self.longitude, scale, self.unavailable)
+            return PositionFields(self.latitude, self.longitude, self.scale or 1.0)
         usual = POSITIONS.get(self.type)
         if self.x and self.y:
             usual = PositionFields(self.x, self.y)
@@ -320,8 +323,13 @@ class Source(CamelModel):
             return None
         # a frame that names the entity is not where the entity is
         frame = self.frame or (usual.frame if usual.frame != self.entity else "")
-        unavailable = {**usual.unavailable, **self.unavailable}
-        return usual._replace(unavailable=unavailable, z=self.z or usual.z, frame=frame)
+        return usual._replace(z=self.z or usual.z, frame=frame)
+
+    @property
+    def silence(self) -> dict[str, Sequence[float]]:
+        """The numbers, by field, with which a message says that it knows nothing."""
+        usual = POSITIONS[self.type].unavailable if self.type in POSITIONS else {}
+        return {**usual, **{field: (number,) for field, number in self.unavailable.items()}}
 
 
 # The identity of an entity: its source and its name.
@@ -439,7 +447,7 @@ def read(text: str, file: str) -> RuleFile:
 
 def _faults(rules: RuleFile) -> Iterator[Fault]:
     names: set[str] = set()
-    ids: list[tuple[str, Rule]] = []
+    identities: list[tuple[Any, Rule]] = []
     for name, listed in rules.sources.items():
         place, frame = listed.position, rules.map
         if place and place.in_degrees and not (frame and frame.on_earth):
@@ -470,23 +478,25 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
                 )
                 yield fault(f"{where}.{kind}.{part}", message)
         field = "demand" if rule.demand is not None else "deploymentRequest"
-        yield from faults_of_demand(
+        if problems := faults_of_demand(
             rule.template, f"{where}.{field}", rule.subjects, rule.momentary
-        )
-        if rule.demand is not None:
-            id = str(rule.demand.get("demand", "")).replace("{rule}", rule.name)
-            for other_id, other in ids:
-                # Two rules may have an event for one entity at the same time if they have a pattern
-                # in common, or if one of them has ``*``. Different patterns that match the same
-                # entity, such as ``car*`` and ``*1``, are not recognized.
-                own, others = {*rule.entities}, {*other.entities}
-                may_meet = "*" in own | others or not own.isdisjoint(others)
-                if id == other_id and may_meet:
-                    message = (
-                        f"is also the id of a demand of rule '{other.name}', so the event that "
-                        "ends first would end the other event's demand; add {rule} to one of the "
-                        "ids"
-                    )
-                    yield fault(f"{where}.demand.demand", message)
-                    break
-            ids.append((id, rule))
+        ):
+            yield from problems
+            continue
+        # what ends an event's demand; a shutdown also ends only what the same requesters joined
+        goal = rule.template.filled({"rule": rule.name})
+        identity = (goal.action, goal.id, goal.requesters if rule.demand is None else ())
+        for other_identity, other in identities:
+            # Two rules may have an event for one entity at the same time if they have a pattern in
+            # common, or if one of them has ``*``. Different patterns that match the same entity,
+            # such as ``car*`` and ``*1``, are not recognized.
+            own, others = {*rule.entities}, {*other.entities}
+            may_meet = "*" in own | others or not own.isdisjoint(others)
+            if identity == other_identity and may_meet:
+                message = (
+                    f"is also the id of a demand of rule '{other.name}', so the event that ends "
+                    "first would end the other event's demand; add {rule} to one of the ids"
+                )
+                yield fault(f"{where}.{field}.{'demand' if rule.demand else 'id'}", message)
+                break
+        identities.append((identity, rule))

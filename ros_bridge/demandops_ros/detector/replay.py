@@ -28,6 +28,8 @@ from demandops.detect.message_reader import (
 from demandops.detect.rule_file import Goal, RuleFile
 from demandops.views.rows import Column
 from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 # ---- a recorded bag, MCAP or sqlite3, read without ROS ----
@@ -37,16 +39,49 @@ from rosbags.typesys import Stores, get_typestore
 REST_OF_BAG = "the rest of the bag"
 
 
+class _TopicsThatAreRead(Reader):
+    # A definition of another topic may be missing, or none that the library can parse.
+
+    def __init__(self, path: Path, is_read: Callable[[Connection], bool]) -> None:
+        super().__init__(path)
+        self._is_read = is_read
+
+    @property
+    def connections(self) -> list[Connection]:
+        return [*filter(self._is_read, self.storage.connections)]
+
+
+def _unsigned(kind: Any) -> Any:  # noqa: ANN401 - of nested tuples
+    if isinstance(kind, tuple):
+        return tuple(map(_unsigned, kind))
+    return "uint8" if kind == "byte" else kind
+
+
 class RecordedBag:
     def __init__(self, path: Path, file: RuleFile) -> None:
         """Open a bag, a folder or an MCAP file, with at least one topic that the rules read."""
+        self._frames = FrameTree(file.map.frame) if file.map and file.map.frame else None
+        wanted = [(source.topic, source.type) for source in file.sources.values()]
+        wanted += [(topic, TF_TYPE) for topic in TF_TOPICS if self._frames]
+
+        def is_read(connection: Connection) -> bool:
+            topic, type_name = connection.topic, connection.msgtype
+            return any(
+                type_name == each and entity_in(at, topic) is not None for at, each in wanted
+            )
+
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+            if self._reader.is2:
+                self._reader.readers = [_TopicsThatAreRead(path, is_read)]
             self._reader.open()
+            # a `byte` is 0 to 255, as live; the library takes it as signed
+            definitions = self._reader.typestore.fielddefs
+            for name, (constants, fields) in definitions.items():
+                definitions[name] = constants, [(each, _unsigned(kind)) for each, kind in fields]
         except Exception as error:  # a damaged bag makes the library raise errors of any kind
             message = f"is not a bag that can be read: {one_line(str(error))}"
             raise InvalidInput.at("", message, file=str(path)) from None
-        self._frames = FrameTree(file.map.frame) if file.map and file.map.frame else None
         self._readers = {name: MessageReader(file, name, self._frames) for name in file.sources}
         self._sources: dict[int, list[tuple[str, str]]] = {}
         self.topics: set[str] = set()
@@ -55,7 +90,9 @@ class RecordedBag:
         # How many messages could not be read, by topic and reason. One that two sources read counts
         # twice.
         self.left_out: dict[tuple[str, str], int] = {}
-        for connection in self._reader.connections:
+        (reader,) = self._reader.readers
+        recorded = reader.storage.connections if isinstance(reader, Reader) else reader.connections
+        for connection in recorded:
             for name, source in file.sources.items():
                 if (entity := entity_in(source.topic, connection.topic)) is None:
                     continue
@@ -65,12 +102,11 @@ class RecordedBag:
                 else:
                     self.unread[connection.topic] = connection.msgtype
         if not self.topics:
-            sources = file.sources.values()
-            wanted = ", ".join(f"{source.topic} ({source.type})" for source in sources)
-            topics = sorted({f"{item.topic} ({item.msgtype})" for item in self._reader.connections})
-            recorded = ", ".join(topics) or "no topic"
+            topics = sorted({f"{item.topic} ({item.msgtype})" for item in recorded})
+            named = ", ".join(f"{topic} ({type_name})" for topic, type_name in wanted)
+            has = ", ".join(topics) or "no topic"
             self.close()
-            message = f"has no topic that the rules read: {wanted}; it has {recorded}"
+            message = f"has no topic that the rules read: {named}; it has {has}"
             raise InvalidInput.at("", message, file=str(path))
 
     def close(self) -> None:
@@ -83,13 +119,7 @@ class RecordedBag:
         return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
 
     def observations(self) -> Iterator[Observation]:
-        connections = [
-            item
-            for item in self._reader.connections
-            if item.id in self._sources
-            or (self._frames and item.topic in TF_TOPICS and item.msgtype == TF_TYPE)
-        ]
-        messages = self._reader.messages(connections=connections)
+        messages = self._reader.messages(self._reader.connections)
         while True:
             try:
                 connection, nanoseconds, data = next(messages)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import pairwise, product
 from math import cos, hypot, pi, radians, sin
 from operator import itemgetter
 from types import SimpleNamespace as Message
@@ -135,9 +135,14 @@ def test_a_reference_system_has_its_own_origin() -> None:
 
 
 def test_a_position_that_is_not_known_counts_as_silence() -> None:
-    assert place(reader(FIX, map=AACHEN), fix(0.0, 0.0, status=-1)) is None
-    assert place(reader(CAM, map=AACHEN), cam(900_000_001, 1_800_000_001)) is None
-    assert place(reader(CAM, map=AACHEN), cam(507_784_000, 1_800_000_001)) is None
+    named = reader(FIX, map=AACHEN, latitude="latitude", longitude="longitude")
+    for reads, status in product((reader(FIX, map=AACHEN), named), (-1, -2)):
+        assert place(reads, fix(0.0, 0.0, status)) is None
+    trusts = reader(FIX, map=AACHEN, unavailable={"status.status": -1})
+    assert place(trusts, fix(*AACHEN.values(), status=-2)) == (0, 0)
+    for reads in (reader(name, map=AACHEN) for name in (CAM, "etsi_its_cam_ts_msgs/msg/CAM")):
+        assert place(reads, cam(900_000_001, 1_800_000_001)) is None
+        assert place(reads, cam(507_784_000, 1_800_000_001)) is None
     own = reader(x="x", y="y", unavailable={"quality": 0})
     assert place(own, Message(x=1, y=2, quality=0)) is None
     assert place(own, Message(x=1, y=2, quality=1)) == (1, 2)

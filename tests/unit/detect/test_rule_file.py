@@ -53,6 +53,9 @@ def test_two_rules_for_the_same_entities_have_demands_of_their_own() -> None:
     (told,) = faults(text_of(rule("a", near=NEAR, demand=same), rule("b", near=far, demand=other)))
     assert (told.line, told.field) == (30, "rules[1].demand.demand")
     assert "is also the id of a demand of rule 'a'" in told.message
+    join = {"id": "r", "connections": [{"requester_ids": ["{entity}"], "source_node_id": "a"}]}
+    twice = (rule(name, near=NEAR, deploymentRequest=join) for name in "ab")
+    assert [each.field for each in faults(text_of(*twice))] == ["rules[1].deploymentRequest.id"]
     cars = rule("a", near=NEAR, demand=same, entities=["car*"])
     rule_file.read(text_of(cars, rule("b", near=far, entities=["bus*"])), "rules.yaml")
 

@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from demandops import __version__
-from demandops.base import addresses
+from demandops.base import addresses, strict_yaml
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.naming import PATTERN_WORDS
 from demandops.base.quoting import quoted
@@ -73,7 +73,13 @@ def _templates(what: str) -> dict[str, str]:
 
 
 def _filled(text: str, given: Mapping[str, str]) -> str:
-    return re.sub("@([A-Z_]+)@", lambda match: given[match[1]], text)
+    def write(match: re.Match[str]) -> str:
+        before, value = match[1] or "", given[match[2]]
+        # YAML reads some words, such as `on`, as no text
+        is_text = not before or strict_yaml.plain_value(value) == value
+        return before + (value if is_text else json.dumps(value))
+
+    return re.sub("(?m)(: (?=@[A-Z_]+@$))?@([A-Z_]+)@", write, text)
 
 
 # ---- ``new image``: a container file and pipelines for a ROS package ----
@@ -249,6 +255,10 @@ def application(  # noqa: PLR0913 - as many as options
         raise InvalidInput.at("NAME", f"{quoted(name)} cannot be used here; write {words}")
     if name in (*config.appdefs, *config.charts, *config.images, _SYNC):
         raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")
+    roles, names = [role for role, _ in inputs], [service.name for service in services]
+    for option, given in (("--input", roles), ("--service", names)):
+        if twice := next((each for each in given if given.count(each) > 1), ""):
+            raise InvalidInput.at(option, f"'{twice}' is there twice; choose another name")
     types = dict(inputs)
     # a demand can name only nodes in an access domain
     known = (*config.domain_of, *config.example_nodes())
@@ -360,6 +370,7 @@ def _application_files(
             f"| `{service.name}` | `{service.executable}` of the ROS package `{service.package}` "
             f"| {', '.join(f'`{origin}`' for origin in inputs.values())} |\n"
         )
+        parameters = {role: f"{role.replace('-', '_')}_topics" for role in inputs}
         modules = {role: type.replace("/", ".") for role, type in types_of.items()}
         packages = sorted({"rclpy", *(module.rpartition(".")[0] for module in modules.values())})
         own = {
@@ -367,9 +378,14 @@ def _application_files(
             "PACKAGE": service.package,
             "FILE": service.executable,
             "ROLE": service.role,
-            "TOPICS": "".join(f"    {role}_topics: {{{{ topics.{role} }}}}\n" for role in inputs),
+            "TOPICS": "".join(
+                f'    {parameter}: {{{{ topics["{role}"] }}}}\n'
+                for role, parameter in parameters.items()
+            ),
             "IMPORTS": "\n".join(f"import {package}" for package in packages),
-            "INPUTS": "\n".join(f'    "{role}_topics": {modules[role]},' for role in inputs),
+            "INPUTS": "\n".join(
+                f'    "{parameter}": {modules[role]},' for role, parameter in parameters.items()
+            ),
         }
         for path, template in (
             (f"values/{service.name}.yaml.j2", "values.yaml.j2"),
@@ -437,7 +453,10 @@ def _example_demand(
         matching = next((each for each in sorted(config.nodes) if matches(each, (pattern,))), "")
         if pattern.strip("*"):
             requester = matching or pattern.replace("?", "1").replace("*", "")
-    inputs = {role: [{"topic": topics.get(role, f"/{role}"), "source": id}] for role in types}
+    inputs = {
+        role: [{"topic": topics.get(role, f"/{role.replace('-', '_')}"), "source": id}]
+        for role in types
+    }
     fields = {
         "demand": f"{name}-example",
         "requesters": [requester],
