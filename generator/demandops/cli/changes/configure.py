@@ -377,7 +377,7 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             cluster, verb = config.nodes[host].cluster, "cordon" if drained else "uncordon"
             way = shlex.join(["kubectl", verb, "-l", f"{NODE_LABEL}={host}"])
             message = f"'{host}' is as cluster '{cluster}' has it; there, run: {way}"
-            if any(node.gone_since for node in discovered.read(text, path) if node.id == host):
+            if host in config.gone_since:
                 message = f"'{host}' is drained because cluster '{cluster}' has it no longer"
             raise StateRepoError(message)
         try:

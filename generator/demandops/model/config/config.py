@@ -6,6 +6,7 @@ import shlex
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -91,6 +92,8 @@ class Config:
     files: Mapping[str, str]
     # For each node in a further access domain (`edge@city`), the inventory's id (`edge`)
     hosts: Mapping[str, str] = field(default_factory=dict)
+    # Since when its cluster no longer has a node that it had
+    gone_since: Mapping[str, datetime] = field(default_factory=dict)
     # Every override; `demandops.model.ledger.ledger.World` knows which of them have ended
     overrides: Mapping[str, Override] = field(default_factory=dict)
     # The nodes and brokers whose id is a pattern
@@ -265,6 +268,10 @@ class ConfigReader:
         self.incomplete: set[str] = set()
         # The valid entries whose id is a pattern, by collection
         self.patterns = defaultdict[str, list[EntryPattern[Any]]](list)
+        # For each cluster that says which nodes it has, what these have besides
+        self.of_clusters: list[EntryPattern[Node]] = []
+        # The discovered nodes that their clusters no longer have, since when
+        self.gone_since: dict[str, datetime] = {}
         # The valid files with items, but without the items
         self.heads: dict[str, BaseModel] = {}
         # By collection: why an id that a pattern matches is no entry, or nothing
