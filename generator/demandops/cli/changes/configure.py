@@ -356,7 +356,7 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
     with writable(options) as repo:
         config = repo.snapshot().state.config
         if node not in config.nodes:
-            message = f"there is no node '{node}'{suggestion(node, config.nodes)}"
+            message = f"{quoted(node)} {config.why_no_node(node)}"
             if node in config.node_patterns:
                 place = config.node_patterns[node].where
                 flag = "true" if drained else "false"
@@ -367,8 +367,8 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             raise StateRepoError(f"'{host}' is {'drained already' if drained else 'not drained'}")
         if host not in config.entry_files[NODES_FILE]:
             message = (
-                f"'{host}' is not listed: a pattern in {config.place_of(NODES_FILE)} gives it; "
-                "list it there, with what it shall have of its own"
+                f"'{host}' is not listed: a pattern in {config.file_of(NODES_FILE, host)} gives "
+                "it; list it there, with what it shall have of its own"
             )
             raise StateRepoError(message)
         path = config.file_of(NODES_FILE, host)

@@ -192,6 +192,12 @@ class Config:
             return may_match(pattern, self.kinds)
         return pattern in self.nodes or pattern in self.kinds
 
+    def why_no_node(self, id: str) -> str:
+        """Say of an id that is no node why no pattern gives it, or what is nearly written so."""
+        if problem := self.unlisted.why_not(id):
+            return problem
+        return f"is not in {self.place_of(NODES_FILE)}{suggestion(id, self.kinds)}"
+
     def example_nodes(self) -> Iterator[str]:
         """Yield for each pattern an id of a node in an access domain, as far as it is found."""
         for pattern in self.node_patterns.values():
