@@ -243,9 +243,10 @@ class Config:
         node, domain = self.nodes.get(id), self.domain_of.get(id)
         if node is None or domain is None:  # a person removed it while claims name it
             missing = self.place_of(NODES_FILE) if node is None else "any access domain"
+            what = self.unlisted.why_not(id) or f"not in {missing}; restore it there"
             message = (
-                f"'{id}' is in use, but not in {missing}; restore it there, or release all that "
-                f"uses it: demandops decommission {shlex.quote(id)}"
+                f"'{id}' is in use, but {what}, or release all that uses it: "
+                f"demandops decommission {shlex.quote(id)}"
             )
             file = NODES_FILE if node is None else DOMAINS_FILE
             raise Refused.at("node", message, code="unknown-node", file=file)
