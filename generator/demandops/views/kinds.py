@@ -13,7 +13,7 @@ from typing import Any
 
 from demandops.base.errors import InvalidInput
 from demandops.base.naming import SubjectKind
-from demandops.base.placeholders import is_pattern
+from demandops.base.placeholders import is_pattern, texts
 from demandops.cluster.health import Health
 from demandops.cluster.rollouts import ReleaseStatus
 from demandops.decide.bookkeeping import (
@@ -550,7 +550,12 @@ def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
     gone_since = source.config.gone_since.get(source.config.host_of(id))
     state = "open" if node else "not in the inventory"
     if is_pattern(id):  # it stands for all nodes that it matches
-        node = source.config.kinds[id]
+        data = source.config.node_patterns[id.partition("@")[0]].data
+        written = {name: data.get(name, ()) for name in ("type", "capabilities")}
+        written["properties"] = data.get("properties", {})
+        if any(is_pattern(text) for _, text in texts(data.get("position"))):
+            written["position"] = None
+        node = source.config.kinds[id].model_copy(update=written)
         state, possible = "pattern", source.config.domains_at(node)
         domain = possible[0] if len(possible) == 1 else None
     return {

@@ -357,8 +357,8 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
         config = repo.snapshot().state.config
         if node not in config.nodes:
             message = f"{quoted(node)} {config.why_no_node(node)}"
-            if node in config.node_patterns:
-                place = config.node_patterns[node].where
+            if pattern := config.node_patterns.get(node.partition("@")[0]):
+                place = pattern.where
                 flag = "true" if drained else "false"
                 message = f"is a pattern of many nodes; write drained: {flag} yourself, in {place}"
             raise InvalidInput.at("NODE", message)

@@ -196,6 +196,8 @@ class Config:
         """Say of an id that is no node why no pattern gives it, or what is nearly written so."""
         if problem := self.unlisted.why_not(id):
             return problem
+        if id in self.kinds:
+            return "is a pattern; name one that it matches"
         return f"is not in {self.place_of(NODES_FILE)}{suggestion(id, self.kinds)}"
 
     def example_nodes(self) -> Iterator[str]:
