@@ -23,6 +23,13 @@ def names(text: str) -> list[str]:
     return _PLACEHOLDER.findall(text)
 
 
+def shape_of(id: str) -> str:
+    """Return an id in which placeholders have numbers for names, in their order."""
+    order = dict.fromkeys(names(id))
+    numbers = {name: f"{{_{number}}}" for number, name in enumerate(order)}
+    return _PLACEHOLDER.sub(lambda match: numbers[match[1]], id)
+
+
 def is_pattern(id: object) -> bool:
     return isinstance(id, str) and _PLACEHOLDER.search(id) is not None
 

@@ -15,6 +15,7 @@ from functools import cache
 from typing import Literal, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault, suggestion
+from demandops.base.quoting import quoted
 from demandops.connections.connection import ClientKey
 from demandops.decide import carriers, warnings
 from demandops.decide.admission import admission, permission
@@ -495,7 +496,9 @@ def may_demand(
         ("--version", version, versions),
     ):
         if word and word not in known:
-            raise Refused.at(field, f"'{word}' is not known{suggestion(word, known)}")
+            is_node = known is config.nodes
+            why = config.why_no_node(word) if is_node else f"is not known{suggestion(word, known)}"
+            raise Refused.at(field, f"{quoted(word)} {why}")
     answer = Answer(node, (fault("node", "no node is in an access domain"),), (), ())
     for name in [node] if node else [*sorted(config.domain_of), *config.example_nodes()]:
         held = Application(f"may/{requester}", appdef, name, version=version)

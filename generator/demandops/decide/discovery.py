@@ -66,6 +66,8 @@ class Discovered(NamedTuple):
     path: str
     text: str | None
     came: tuple[str, ...] = ()
+    # what the cluster has no longer, and what is taken out therefore
+    gone: tuple[str, ...] = ()
     left: tuple[str, ...] = ()
     changed: tuple[str, ...] = ()
     # the ids that the file did not have before
@@ -94,7 +96,7 @@ def discover(
     by_id = defaultdict[str, list[ClusterNode]](list)
     for source in seen:
         by_id[source.labels.get(NODE_LABEL, "")].append(source)
-    nodes, came, left, changed = dict[str, DiscoveredNode](), [], [], []
+    nodes, came, gone, left, changed = dict[str, DiscoveredNode](), [], [], [], []
     for id, sources in sorted(by_id.items()):
         source, old = sources[0], known.get(id)
         file = files.get(id, path)
@@ -120,11 +122,12 @@ def discover(
             continue
         nodes[id] = known[id].model_copy(update={"gone_since": since})
         if known[id].gone_since is None:
-            left.append(f"{id}: not in the cluster any more, so it is drained")
+            gone.append(f"{id}: not in the cluster any more, so it is drained")
     return Discovered(
         path,
         text_of(nodes.values()) if nodes or before is not None else None,
         tuple(came),
+        tuple(gone),
         tuple(left),
         tuple(changed),
         tuple(sorted(nodes.keys() - known.keys())),

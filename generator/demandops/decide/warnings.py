@@ -12,7 +12,8 @@ from difflib import SequenceMatcher
 from itertools import combinations, groupby, islice
 
 from demandops.base import strict_yaml
-from demandops.base.errors import Fault, InvalidInput, fault, suggestion
+from demandops.base.errors import Fault, InvalidInput, fault, field_path, suggestion
+from demandops.base.placeholders import example_of, is_pattern, shape_of
 from demandops.base.quantities import amount_of, amount_text
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
@@ -376,6 +377,15 @@ def truth_warnings(files: Mapping[str, str]) -> Iterator[Fault]:
 
 
 def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
+    twins: dict[tuple[str, str], str] = {}
+    for kind in (config.node_patterns, config.broker_patterns):
+        for entry in kind.values():
+            named = f"{quoted(entry.id)} in {entry.where}"
+            twin = twins.setdefault((entry.key, shape_of(entry.id)), named)
+            if twin != named:
+                message = f"{quoted(entry.id)} matches what {twin} does, so neither gives anything"
+                place = f"{field_path(entry.place)}.{entry.key}"
+                yield fault(place, f"{message}; remove one of them").within(entry.file)
     kinds_of_nodes = sorted(config.kinds_of_nodes(), key=lambda node: node.id)
     nodes = tuple(node.id for node in kinds_of_nodes)
     brokers = (*config.brokers, *config.broker_patterns)
@@ -396,8 +406,11 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
         file = config.file_of(DOMAINS_FILE, name)
         for where, patterns, what, names in kinds:
             for pattern in patterns:
-                if pattern != "*" and not may_match(pattern, names):
+                is_template = is_pattern(pattern)  # only ids in the inventory have placeholders
+                if is_template or (pattern != "*" and not may_match(pattern, names)):
                     hint = suggestion(pattern, names) or "; there is none"
+                    if is_template:
+                        hint = f"; write {quoted(example_of(pattern, '*'))}"
                     message = f"{quoted(pattern)} matches no {what}{hint}"
                     yield fault(f"access domain '{name}', {where}", message).within(file)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from demandops.base.errors import InvalidInput
 from demandops.base.naming import SubjectKind
-from demandops.base.placeholders import is_pattern
+from demandops.base.placeholders import is_pattern, texts
 from demandops.cluster.health import Health
 from demandops.cluster.rollouts import ReleaseStatus
 from demandops.decide.bookkeeping import (
@@ -547,19 +547,26 @@ def _nodes(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
     node, domain = source.config.nodes.get(id), source.config.domain_of.get(id)
+    gone_since = source.config.gone_since.get(source.config.host_of(id))
     state = "open" if node else "not in the inventory"
     if is_pattern(id):  # it stands for all nodes that it matches
-        node = source.config.kinds[id]
+        data = source.config.node_patterns[id.partition("@")[0]].data
+        written = {name: data.get(name, ()) for name in ("type", "capabilities")}
+        written["properties"] = data.get("properties", {})
+        if any(is_pattern(text) for _, text in texts(data.get("position"))):
+            written["position"] = None
+        node = source.config.kinds[id].model_copy(update=written)
         state, possible = "pattern", source.config.domains_at(node)
         domain = possible[0] if len(possible) == 1 else None
     return {
         "name": id,
-        "state": "drained" if node and node.drained else state,
+        "state": "gone" if gone_since else "drained" if node and node.drained else state,
         "type": node.type if node else None,
         "cluster": node.cluster if node else None,
         "domain": domain.name if domain else None,
         "file": source.config.file_of(NODES_FILE, source.config.host_of(id)) if node else None,
         "drained": bool(node and node.drained),
+        "gone_since": time_data(gone_since),
         "capabilities": list(node.capabilities) if node else [],
         "properties": dict(node.properties) if node else {},
         "position": node.position.model_dump() if node and node.position else None,
@@ -801,6 +808,7 @@ KINDS: dict[str, Kind] = {
                 ),
                 *(REQUESTERS, _wide("capabilities", "Capabilities")),
                 *(_wide("properties", "Properties", texts_of=_properties), _wide("file", "File")),
+                Column("gone_since", "Gone since", 9, "time", only_wide=True),
             ),
             _nodes,
             _node,

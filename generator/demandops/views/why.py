@@ -356,7 +356,9 @@ def _node(source: Source, thing: Thing) -> Json:
     held = _held(source, claims, running)
     what = "not in the inventory"
     if node:
+        since = source.config.gone_since.get(source.config.host_of(thing.name))
         drained = ", drained" if node.drained else ""
+        drained = f", gone since {since:%Y-%m-%d %H:%M:%S} UTC" if since else drained
         what = f"{node.type} in cluster {node.cluster}, access domain "
         what += f"{domain.name if domain else 'none'}{drained}"
         listed = source.config.file_of(NODES_FILE, thing.name)

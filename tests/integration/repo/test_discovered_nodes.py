@@ -217,6 +217,7 @@ def test_what_people_name_stays(cluster: Cluster, person: Person, clock: Clock) 
     cluster.nodes.clear()
     cluster.look()
     assert cluster.state.config.nodes["bus1"].drained, "it is gone"
+    assert cluster.newest.startswith("Nodes of c-its: 2 gone\n")
     clock.pass_(600)
     cluster.look()
     assert [*cluster.listed] == ["bus0", "bus1"]

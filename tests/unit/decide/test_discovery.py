@@ -54,8 +54,7 @@ def test_a_file_follows_its_cluster(case: dict[str, Any]) -> None:
     found = discover(cluster, now, before, NOW, files, unfit, lambda id: id in needed)
     assert found.path == PATH
     assert not found.text or discovered.text_of(discovered.read(found.text, PATH)) == found.text
-    told = {"came": found.came, "left": found.left, "changed": found.changed}
-    told["problems"] = found.problems
+    told = {w: getattr(found, w) for w in ("came", "gone", "left", "changed", "problems")}
     after = strict_yaml.load(found.text)["nodes"] if found.text else None
     assert after == case.get("after")
     assert {name: [*lines] for name, lines in told.items() if lines} == {
@@ -70,12 +69,13 @@ def test_labels_add_to_what_each_node_has() -> None:
     entry = {"capabilities": ["gpu"], "properties": {"size": 1, "doors": 2}, "capacity": {"gpu": 1}}
     how = f", discovery: {{entry: {json.dumps(entry)}}}}}]"
     clusters = FROM_CLUSTER.replace("}]", how)
-    own = {"capabilities": ["lidar"], "properties": {"size": 3}, "capacity": {"cpu": "4"}}
+    own = {"capabilities": ["lidar"], "properties": {"size": 3}}
+    own["capacity"] = {"cpu": "4", "nvidia.com/gpu": "2"}
     files = {"inventory/clusters.yaml": clusters, PATH: nodes([{"id": "bus0", **own}])}
     node = load(configuration(files)).nodes["bus0"]
     assert node.capabilities == ("gpu", "lidar")
     assert node.properties == {"size": 3, "doors": 2}
-    assert node.capacity == {"cpu": "4", "gpu": "1"}
+    assert node.capacity == {"cpu": "4", "gpu": "2"}, "two names of one resource"
 
 
 def test_the_faults_of_an_edited_file_are_told_there() -> None:
@@ -117,7 +117,7 @@ def test_whatever_a_cluster_says_the_configuration_stays_valid(
         cloud = config.nodes["cloud"]
         assert (cloud.type, cloud.drained) == ("cloud", False), "as it is listed"
         again = discover(cluster, seen, text, NOW, {}, {}, lambda id: False)
-        assert (again.text, again.came, again.left, again.changed) == (text, (), (), ())
+        assert (again.text, again.came, again.gone, again.changed) == (text, (), (), ())
 
 
 def test_values_and_nodes_that_contradict_other_files_do_not_count() -> None:

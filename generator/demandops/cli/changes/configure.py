@@ -356,9 +356,9 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
     with writable(options) as repo:
         config = repo.snapshot().state.config
         if node not in config.nodes:
-            message = f"there is no node '{node}'{suggestion(node, config.nodes)}"
-            if node in config.node_patterns:
-                place = config.node_patterns[node].where
+            message = f"{quoted(node)} {config.why_no_node(node)}"
+            if pattern := config.node_patterns.get(node.partition("@")[0]):
+                place = pattern.where
                 flag = "true" if drained else "false"
                 message = f"is a pattern of many nodes; write drained: {flag} yourself, in {place}"
             raise InvalidInput.at("NODE", message)
@@ -367,8 +367,8 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             raise StateRepoError(f"'{host}' is {'drained already' if drained else 'not drained'}")
         if host not in config.entry_files[NODES_FILE]:
             message = (
-                f"'{host}' is not listed: a pattern in {config.place_of(NODES_FILE)} gives it; "
-                "list it there, with what it shall have of its own"
+                f"'{host}' is not listed: a pattern in {config.file_of(NODES_FILE, host)} gives "
+                "it; list it there, with what it shall have of its own"
             )
             raise StateRepoError(message)
         path = config.file_of(NODES_FILE, host)
@@ -377,7 +377,7 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             cluster, verb = config.nodes[host].cluster, "cordon" if drained else "uncordon"
             way = shlex.join(["kubectl", verb, "-l", f"{NODE_LABEL}={host}"])
             message = f"'{host}' is as cluster '{cluster}' has it; there, run: {way}"
-            if any(node.gone_since for node in discovered.read(text, path) if node.id == host):
+            if host in config.gone_since:
                 message = f"'{host}' is drained because cluster '{cluster}' has it no longer"
             raise StateRepoError(message)
         try:

@@ -247,11 +247,7 @@ def _connection_faults(connection: Connection, config: Config, claiming: bool) -
 def _node_faults(where: str, node: str, config: Config) -> Iterator[Fault]:
     # an empty node is reported as an empty id
     if node and node not in config.nodes:
-        problem = config.unlisted.why_not(node) or (
-            f"is not in {config.place_of(NODES_FILE)}"
-            + suggestion(node, (each.id for each in config.kinds_of_nodes()))
-        )
-        yield fault(where, f"{quoted(node)} {problem}", code="unknown-node")
+        yield fault(where, f"{quoted(node)} {config.why_no_node(node)}", code="unknown-node")
     elif node and node not in config.domain_of:
         why = config.unlisted.why_not(node) or config.unlisted.of_several_domains(node)
         problem = why or (

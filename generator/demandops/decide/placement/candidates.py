@@ -275,7 +275,8 @@ class Choice:
 
     def _closed(self, node: Node) -> str:
         if node.drained:
-            return "is drained"
+            is_gone = self.config.host_of(node.id) in self.config.gone_since
+            return "is gone from its cluster" if is_gone else "is drained"
         return "" if node.id in self.config.domain_of else "is in no access domain"
 
     def _is_permitted(self, node: Node) -> bool:

@@ -6,6 +6,7 @@ import shlex
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -91,6 +92,8 @@ class Config:
     files: Mapping[str, str]
     # For each node in a further access domain (`edge@city`), the inventory's id (`edge`)
     hosts: Mapping[str, str] = field(default_factory=dict)
+    # Since when its cluster no longer has a node that it had
+    gone_since: Mapping[str, datetime] = field(default_factory=dict)
     # Every override; `demandops.model.ledger.ledger.World` knows which of them have ended
     overrides: Mapping[str, Override] = field(default_factory=dict)
     # The nodes and brokers whose id is a pattern
@@ -189,6 +192,14 @@ class Config:
             return may_match(pattern, self.kinds)
         return pattern in self.nodes or pattern in self.kinds
 
+    def why_no_node(self, id: str) -> str:
+        """Say of an id that is no node why no pattern gives it, or what is nearly written so."""
+        if problem := self.unlisted.why_not(id):
+            return problem
+        if id in self.kinds:
+            return "is a pattern; name one that it matches"
+        return f"is not in {self.place_of(NODES_FILE)}{suggestion(id, self.kinds)}"
+
     def example_nodes(self) -> Iterator[str]:
         """Yield for each pattern an id of a node in an access domain, as far as it is found."""
         for pattern in self.node_patterns.values():
@@ -234,9 +245,10 @@ class Config:
         node, domain = self.nodes.get(id), self.domain_of.get(id)
         if node is None or domain is None:  # a person removed it while claims name it
             missing = self.place_of(NODES_FILE) if node is None else "any access domain"
+            what = self.unlisted.why_not(id) or f"not in {missing}; restore it there"
             message = (
-                f"'{id}' is in use, but not in {missing}; restore it there, or release all that "
-                f"uses it: demandops decommission {shlex.quote(id)}"
+                f"'{id}' is in use, but {what}, or release all that uses it: "
+                f"demandops decommission {shlex.quote(id)}"
             )
             file = NODES_FILE if node is None else DOMAINS_FILE
             raise Refused.at("node", message, code="unknown-node", file=file)
@@ -265,6 +277,10 @@ class ConfigReader:
         self.incomplete: set[str] = set()
         # The valid entries whose id is a pattern, by collection
         self.patterns = defaultdict[str, list[EntryPattern[Any]]](list)
+        # For each cluster that says which nodes it has, what these have besides
+        self.of_clusters: list[EntryPattern[Node]] = []
+        # The discovered nodes that their clusters no longer have, since when
+        self.gone_since: dict[str, datetime] = {}
         # The valid files with items, but without the items
         self.heads: dict[str, BaseModel] = {}
         # By collection: why an id that a pattern matches is no entry, or nothing

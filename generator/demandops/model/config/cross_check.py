@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from demandops.base import naming, strict_yaml
-from demandops.base.errors import InvalidInput, suggestion
+from demandops.base.errors import InvalidInput, field_path, suggestion
 from demandops.connections import connection_types
 from demandops.model.config import config as configs
 from demandops.model.config.appdef import Deployed, ServiceDefinition
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config, ConfigReader
-from demandops.model.config.inventory import comparable_kind, kind_of
+from demandops.model.config.inventory import Node, comparable_kind, kind_of
 from demandops.model.config.override import patched_settings
 from demandops.model.config.registry import ChartSource
 from demandops.templating import charts
@@ -34,8 +36,7 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
 def _check_inventory(config: Config, reader: ConfigReader) -> None:
     roles = {role for appdef in config.appdefs.values() for role in appdef.inputs}
     folders: dict[str, str] = {}
-    for node in config.kinds_of_nodes():
-        file, place = reader.places[configs.NODES_FILE][node.id]
+    for node, file, place in _nodes(config, reader):
         other = folders.setdefault(folder := naming.object_name("", node.id), node.id)
         if other != node.id:
             message = f"'{other}' has the folder {folder} too; choose another id"
@@ -47,7 +48,7 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
         for field, name, collection in named:
             reader.check_reference(file, f"{place}.{field}", name, collection, node.id)
         for name, value in node.properties.items():
-            kind, first = config.property_kinds[name]
+            kind, first = config.property_kinds.get(name, (kind_of(value), ""))
             if kind_of(value) != kind and node.id not in config.hosts:  # once for each host
                 where = f"at '{first}' in {config.file_of(configs.NODES_FILE, first)}"
                 message = f"is {kind_of(value)}, but the property is {kind} {where}"
@@ -61,6 +62,15 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
     for broker in (*config.brokers.values(), *examples):
         file, place = reader.places[configs.BROKERS_FILE][broker.node]
         reader.check_reference(file, f"{place}.node", broker.node, configs.NODES_FILE, broker.node)
+
+
+def _nodes(config: Config, reader: ConfigReader) -> Iterator[tuple[Node, str, str]]:
+    """Yield each kind of node with its file and place, also what nodes of clusters have besides."""
+    for node in config.kinds_of_nodes():
+        yield node, *reader.places[configs.NODES_FILE][node.id]
+    for pattern in reader.of_clusters:
+        entry = pattern.example.model_copy(update={"bridged": {}})  # its peers may come with it
+        yield entry, pattern.file, field_path(pattern.place)
 
 
 def _check_domains(config: Config, reader: ConfigReader) -> None:
@@ -89,10 +99,13 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
             reader.add_fault(file, f"{place}.namespace", message)
         if domain.pod_security == "baseline":
             closed = closed or domain.name
-    for node in config.kinds_of_nodes():
-        strict = (d for d in config.domains_at(node) if d.pod_security == "baseline")
+    # which domain a node of a cluster is in, only its id says
+    anywhere = [*config.domains.values()]
+    anywhere *= all(domain.pod_security == "baseline" for domain in anywhere)
+    for node, file, place in _nodes(config, reader):
+        own = config.domains_at(node) if config.kinds.get(node.id) is node else anywhere
+        strict = (d for d in own if d.pod_security == "baseline")
         if node.host_network and (owner := next(strict, None)):
-            file, place = reader.places[configs.NODES_FILE][node.id]
             message = (
                 f"is true (the default), and podSecurity of access domain '{owner.name}' is "
                 "baseline, which forbids it; set 'hostNetwork: false' or "

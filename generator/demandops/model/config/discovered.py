@@ -117,6 +117,7 @@ def read_nodes(
         pattern, path = _pattern(reader, cluster), path_of(name)
         try:
             examples.append(pattern.example)  # the faults of the entry are those of its file
+            reader.of_clusters.append(pattern)
             known = read(reader.files.get(path), path)
         except InvalidInput as error:
             reader.faults += error.faults
@@ -127,7 +128,8 @@ def read_nodes(
                 continue
             places[node.id] = (path, f"nodes[{number}]")
             own = node.model_dump(by_alias=True, exclude_defaults=True, exclude={"gone_since"})
-            own["drained"] = node.drained or node.gone_since is not None
+            if node.gone_since is not None:
+                own["drained"], reader.gone_since[node.id] = True, node.gone_since
             try:
                 here = replace(pattern, file=path, place=("nodes", number))
                 nodes[node.id] = here.entry(node.id, own)
@@ -171,6 +173,7 @@ class InvalidConfig(InvalidInput):
         for id, at in reader.places[NODES_FILE].items():
             ids.setdefault(at, id)  # a machine's own node is before those of its further domains
         self.of_nodes: dict[str, object] = {}
+        told = {(fault.file, fault.field) for fault in reader.faults}
         for fault in reader.faults:
             match = _OF_NODE.fullmatch(fault.field) if is_discovered(fault.file) else None
             # the faults of an edited file, from which no node was read, are its own
@@ -184,5 +187,6 @@ class InvalidConfig(InvalidInput):
                 field = f"{place}.discovery.entry" + (f".{match[2]}" if match[2] else "")
                 fault = replace(fault, file=file, field=field)  # noqa: PLW2901
             self.of_nodes.setdefault(owner, fault)
-            faults.setdefault((fault.file, fault.field), fault)
+            if (fault.file, fault.field) not in told:  # the entry itself may have the fault
+                faults.setdefault((fault.file, fault.field), fault)
         super().__init__(faults.values())

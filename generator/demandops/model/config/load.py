@@ -13,7 +13,7 @@ from pathlib import PurePosixPath
 from types import MappingProxyType
 from typing import Any, TypeVar
 
-from demandops.base.errors import suggestion
+from demandops.base.errors import field_path, suggestion
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION, RENDER_VERSION
 from demandops.model.config import config as configs
@@ -77,13 +77,20 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         configs.DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name"
     )
     settings = repository or _ANY
-    examples = {each.id: each.example for each in reader.patterns[configs.NODES_FILE]}
-    for id, node in (nodes | examples).items():
+    patterns = reader.patterns[configs.NODES_FILE] + reader.of_clusters
+    for each in patterns:
+        if written := each.example.capacity:
+            place = f"{field_path(each.place)}.capacity"
+            _with_short_names(written, settings, reader, each.file, place)
+    for id, node in nodes.items():
         file, place = reader.places[configs.NODES_FILE][id]
-        if node.capacity is not None:
+        if node.capacity is not None and discovered.is_discovered(file):
+            # of the entry and the cluster, the cluster is the later one
+            named = settings.with_short_names(node.capacity)
+            nodes[id] = node.model_copy(update={"capacity": named})
+        elif node.capacity is not None:
             named = _with_short_names(node.capacity, settings, reader, file, f"{place}.capacity")
-            if id in nodes:
-                nodes[id] = node.model_copy(update={"capacity": named})
+            nodes[id] = node.model_copy(update={"capacity": named})
 
     def completed(node: Node, domain: AccessDomain | None) -> Node:
         node = _in_ros_domain(node, domain)
@@ -196,6 +203,7 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         domain_of=domain_of,
         hosts=hosts,
         files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
+        gone_since=reader.gone_since,
         overrides=MappingProxyType(overrides),
         entry_files={**entry_files, configs.CLIENTS_FILE: client_files},
     )

@@ -375,17 +375,15 @@ def of_override_end(
 
 def of_discovery(found: Sequence[Discovered], releases: tuple[ReleaseChange, ...]) -> str:
     names = [each.path.rpartition("/")[2].removesuffix(".yaml") for each in found]
-    counts = [
-        (sum(len(getattr(each, field)) for each in found), word)
-        for field, word in (("came", "came"), ("left", "left"), ("changed", "changed"))
-    ]
+    words = ("came", "gone", "left", "changed")
+    counts = [(sum(len(getattr(each, word)) for each in found), word) for word in words]
     told = ", ".join(f"{count} {word}" for count, word in counts if count) or "as they are"
     paragraphs = [
         [one_line(f"Nodes of {', '.join(names)}: {told}", _MAX_SUBJECT)],
         [f"Why: {', '.join(names)} said so."],
     ]
     for name, each in zip(names, found, strict=True):
-        signed = [("+", each.came), ("-", each.left), ("~", each.changed)]
+        signed = [("+", each.came), ("-", each.gone), ("-", each.left), ("~", each.changed)]
         lines = [f"  {sign} {line}" for sign, lines in signed for line in lines]
         more = len(lines) - _MOST_NODES
         paragraphs.append([f"{name}:", *lines[:_MOST_NODES]])
