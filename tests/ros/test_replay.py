@@ -118,7 +118,8 @@ def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
 ) -> None:
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"\x89MCAP0\r\n\x01" + b"\xff" * 40)
-    for bag in (tmp_path, broken):
+    write_bag(tmp_path / "empty", [], texts=[])
+    for bag in (tmp_path, broken, tmp_path / "empty"):
         ran = demandops("detect", RULES, "--replay", bag)
         assert ran.code == 1
         assert ran.err.startswith(f"error: {bag}: is not a bag that can be read: ")

@@ -75,6 +75,8 @@ class RecordedBag:
             if self._reader.is2:
                 self._reader.readers = [_TopicsThatAreRead(path, is_read)]
             self._reader.open()
+            if not self._reader.message_count:
+                raise ValueError("it has no messages")
             # a `byte` is 0 to 255, as live; the library takes it as signed
             definitions = self._reader.typestore.fielddefs
             for name, (constants, fields) in definitions.items():
