@@ -14,6 +14,7 @@ from demandops.detect.rule_file import read
 from demandops_ros.detector.detector_node import read_bookkeeping
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
+from rclpy.qos import qos_profile_sensor_data
 
 from tests.kit.cli import Run
 from tests.kit.detection import POSE, text_of
@@ -82,10 +83,21 @@ def test_who_comes_near_demands_until_it_leaves_and_rules_are_reloaded(
     client.wait(lambda: "demands booked before the start: 1" in detecting.log.read_text())
     away["vehicle01"] = AWAY
     client.wait(lambda: held() == set())
+    # what its next publisher sends is heard by no reliable subscription
+    client.node.destroy_publisher(poses["vehicle01"])
+    topic, qos = "/vehicles/vehicle01/pose", qos_profile_sensor_data
+    poses["vehicle01"] = client.node.create_publisher(PoseStamped, topic, qos)
+    away["vehicle01"] = NEAR
+    client.wait(lambda: held() == {"near/vehicle01"})
     assert detecting.stop() == 0
     form = "--format=%(trailers:key=Operation,valueonly)"
     log = git(served.state_repo, "log", "--reverse", form, "main").split()
-    assert [word for word in log if word != "renew"] == ["init", *["put"] * 2, *["release"] * 2]
+    assert [word for word in log if word != "renew"] == [
+        "init",
+        *["put"] * 2,
+        *["release"] * 2,
+        "put",
+    ]
 
 
 def test_bookkeeping_that_cannot_be_read_is_told_and_is_not_used(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import sys
 from pathlib import Path
 from typing import Any
@@ -87,9 +88,9 @@ STATE_FIELDS = "string model\nfloat64[] continuous_state\nbyte kind\n"
 
 
 def test_a_bag_is_read_with_the_message_definitions_that_it_contains(
-    demandops: Run, tmp_path: Path
+    demandops: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The package of EgoData is not installed, so the test writes definitions into the bag."""
+    """Without definitions in the bag, those of an installed package are taken."""
     types = get_typestore(Stores.ROS2_KILTED)
     types.register(get_types_from_msg(STATE_FIELDS, "perception_msgs/msg/ObjectState"))
     types.register(get_types_from_msg(EGO_FIELDS, EGO))
@@ -108,9 +109,17 @@ def test_a_bag_is_read_with_the_message_definitions_that_it_contains(
     rules = tmp_path / "rules.yaml"
     source = f"type: {EGO}\n    unavailable: {{state.kind: 200}}"
     rules.write_text(RULES.read_text().replace(f"type: {POSE}", source))
-    ran = demandops("detect", rules, "--replay", tmp_path / "bag", "--output", "json")
-    told = [(one["second"], one["entities"], one["change"]) for one in ran.json()["events"]]
-    assert told == [(1.0, ["vehicle01"], "start"), (3.0, ["vehicle01"], "stop")]
+    messages = tmp_path / "share" / "perception_msgs" / "msg"
+    messages.mkdir(parents=True)
+    (messages / "EgoData.msg").write_text(EGO_FIELDS)
+    (messages / "ObjectState.msg").write_text(STATE_FIELDS)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    for statement in ("", "DELETE FROM message_definitions"):  # as before ROS 2 Iron
+        with sqlite3.connect(tmp_path / "bag" / "bag.db3") as database:
+            database.execute(statement)
+        ran = demandops("detect", rules, "--replay", tmp_path / "bag", "--output", "json")
+        told = [(one["second"], one["entities"], one["change"]) for one in ran.json()["events"]]
+        assert told == [(1.0, ["vehicle01"], "start"), (3.0, ["vehicle01"], "stop")]
 
 
 def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
@@ -118,7 +127,8 @@ def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
 ) -> None:
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"\x89MCAP0\r\n\x01" + b"\xff" * 40)
-    for bag in (tmp_path, broken):
+    write_bag(tmp_path / "empty", [], texts=[])
+    for bag in (tmp_path, broken, tmp_path / "empty"):
         ran = demandops("detect", RULES, "--replay", bag)
         assert ran.code == 1
         assert ran.err.startswith(f"error: {bag}: is not a bag that can be read: ")

@@ -95,9 +95,10 @@ PARAMETERS = {
 # at a time: rclpy's executor would wake for each, which costs more than to read it. They are read
 # in the order in which they came, so that a bag that was recorded meanwhile gives the same events.
 
-# A subscription is reliable if all publishers that it finds are. The queue is deep, because many
-# entities may share a topic.
-_QOS = QoSProfile(depth=10_000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
+# The queue is deep, because many entities may share a topic.
+_QOS = QoSProfile(depth=10_000, reliability=QoSReliabilityPolicy.RELIABLE)
+# A reliable subscription hears only reliable publishers, so it is replaced when another one comes.
+_LOSSY_QOS = QoSProfile(depth=10_000, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 # Whoever tells of static frames told it once, and keeps it for who comes later.
 _STATIC_QOS = QoSProfile(depth=1000, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -129,7 +130,7 @@ class SourceSubscriptions:
         # by source and topic, with the entity that the topic names
         self.subscriptions: dict[tuple[str, str], tuple[Any, str]] = {}
         self._of_frames = {
-            topic: self._subscribe(TF_TYPE, topic, _STATIC_QOS if is_static else _QOS)
+            topic: self._subscribe(TF_TYPE, topic, _STATIC_QOS if is_static else _LOSSY_QOS)
             for topic, is_static in (TF_TOPICS if self._frames else {}).items()
         }
         # the keys of subscriptions that had messages since the last refresh, or before that one
@@ -138,12 +139,23 @@ class SourceSubscriptions:
         self._told: set[str] = set()
         self.messages = self.unreadable = 0
 
-    def _subscribe(self, type_name: str, topic: str, qos: QoSProfile = _QOS) -> Any:  # noqa: ANN401
+    def _subscribe(self, type_name: str, topic: str, qos: QoSProfile) -> Any:  # noqa: ANN401
         return self._node.create_subscription(
             message_class(type_name), topic, lambda _: None, qos, callback_group=self._group
         )
 
     def refresh(self) -> None:
+        # Who was heard lately publishes. Silent for one turn alone, it may have left a message.
+        silent = self.subscriptions.keys() - self._heard - self._heard_before
+        self._heard, self._heard_before = set(), self._heard
+        shared = {key for key, (_, entity) in self.subscriptions.items() if not entity}
+        for key in silent | shared:
+            subscription, topic = self.subscriptions[key][0], key[1]
+            publishers = self._node.count_publishers(topic)
+            misses_some = publishers > subscription.get_publisher_count()
+            must_change = misses_some and subscription.qos_profile == _QOS != self._qos(topic)
+            if must_change or (not publishers and key in silent):
+                self._node.destroy_subscription(self.subscriptions.pop(key)[0])
         published: Mapping[str, list[str]] = dict(self._node.get_topic_names_and_types())
         for name, source in self._file.sources.items():
             for topic, types in published.items():
@@ -156,14 +168,15 @@ class SourceSubscriptions:
                         f"{topic} is not read, because its type is {', '.join(types)}, and source "
                         f"{name} reads {source.type}"
                     )
-                elif self._node.count_publishers(topic):
-                    self.subscriptions[name, topic] = self._subscribe(source.type, topic), entity
-        # Who was heard lately publishes. Silent for one turn alone, it may have left a message.
-        silent = self.subscriptions.keys() - self._heard - self._heard_before
-        self._heard, self._heard_before = set(), self._heard
-        for key in silent:
-            if not self._node.count_publishers(key[1]):
-                self._node.destroy_subscription(self.subscriptions.pop(key)[0])
+                elif qos := self._qos(topic):
+                    subscription = self._subscribe(source.type, topic, qos)
+                    self.subscriptions[name, topic] = subscription, entity
+
+    def _qos(self, topic: str) -> QoSProfile | None:
+        """Return the quality at which all publishers are heard, ``None`` if there are none."""
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        offered = {each.qos_profile.reliability for each in publishers}
+        return (_LOSSY_QOS if _LOSSY_QOS.reliability in offered else _QOS) if offered else None
 
     def close(self) -> None:
         for each in (*self._of_frames.values(), *(each for each, _ in self.subscriptions.values())):
@@ -271,7 +284,7 @@ class DemandSender:
             what = f"{sending.purpose} of {quoted(sending.goal.id)}"
             if subjects:
                 what += f" for {', '.join(subjects)}"
-            if told:
+            if told and not self._is_closed:
                 log.warning("rule %s: %s failed and will be tried again: %s", rule, what, told)
             elif not outcome.code and sending.purpose != "renew":
                 log.info("rule %s: %s: %s", rule, what, outcome.message)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from html import escape
@@ -30,7 +33,8 @@ from demandops.views.rows import Column
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 # ---- a recorded bag, MCAP or sqlite3, read without ROS ----
 
@@ -57,6 +61,20 @@ def _unsigned(kind: Any) -> Any:  # noqa: ANN401 - of nested tuples
     return "uint8" if kind == "byte" else kind
 
 
+def _installed(type_names: Iterable[str]) -> Typestore:
+    # for a bag without definitions, as SQLite files were before ROS 2 Iron
+    types, unread = get_typestore(Stores.LATEST), {*type_names}
+    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
+    while unread := unread - types.fielddefs.keys():
+        package, _, name = (type_name := unread.pop()).split("/")
+        folders = [Path(prefix, "share", package, "msg") for prefix in prefixes if prefix]
+        for path in [path for folder in folders for path in folder.glob(f"**/{name}.msg")][:1]:
+            definitions = get_types_from_msg(path.read_text(), type_name)
+            types.register(definitions)
+            unread |= {*re.findall(r"\w+/msg/\w+", repr(definitions))}
+    return types
+
+
 class RecordedBag:
     def __init__(self, path: Path, file: RuleFile) -> None:
         """Open a bag, a folder or an MCAP file, with at least one topic that the rules read."""
@@ -71,10 +89,13 @@ class RecordedBag:
             )
 
         try:
-            self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+            installed = _installed(type_name for _, type_name in wanted)
+            self._reader = AnyReader([path], default_typestore=installed)
             if self._reader.is2:
                 self._reader.readers = [_TopicsThatAreRead(path, is_read)]
             self._reader.open()
+            if not self._reader.message_count:
+                raise ValueError("it has no messages")
             # a `byte` is 0 to 255, as live; the library takes it as signed
             definitions = self._reader.typestore.fielddefs
             for name, (constants, fields) in definitions.items():
