@@ -282,7 +282,7 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
             continue
         if is_pattern(node.id):
             data = config.node_patterns[node.id.partition("@")[0]].data
-            written = data.get("selector", node.selector).items()
+            written = (data.get("selector") or node.selector).items()
             tests = [_has(k, f".matches({_text(f'^{any_value_of(v)}$')})") for k, v in written]
             by_pattern.append(f"({' && '.join(tests) or 'true'})")
         elif len(node.selector) == 1:

@@ -108,7 +108,10 @@ def may_match(pattern: str, ids: Iterable[str]) -> bool:
 
 @dataclass(frozen=True)
 class EntryPattern(Generic[Entry]):
-    """``data`` is the entry as it is written in ``file`` at ``place``; ``key`` names its id."""
+    """``data`` is the entry as it is written in ``file`` at ``place``; ``key`` names its id.
+
+    ``numbers`` are the properties that are numbers elsewhere.
+    """
 
     id: str
     key: str
@@ -116,6 +119,7 @@ class EntryPattern(Generic[Entry]):
     data: Mapping[str, Any]
     file: str
     place: tuple[int | str, ...]
+    numbers: frozenset[str] = frozenset()
 
     @property
     def where(self) -> str:
@@ -146,6 +150,9 @@ class EntryPattern(Generic[Entry]):
                     data[name] = known | value
                 case _:
                     data[name] = value
+        for name, value in data.get("properties", {}).items() if self.numbers else ():
+            if name in self.numbers and isinstance(value, str):
+                _read_number(self.data, data, ("properties", name))
         try:
             try:
                 return self.model.model_validate(data)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from itertools import chain
 from pathlib import PurePosixPath
 from types import MappingProxyType
@@ -72,6 +73,15 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     of_appdefs = chain.from_iterable(appdef.services.values() for appdef in appdefs.values())
     deployed = (*of_appdefs, *definitions.values())
     required = [each.place.properties for each in deployed if each.place]
+    by_people = (*(node.properties for node in nodes.values()), *required)
+    numbers = frozenset(
+        name
+        for properties in by_people
+        for name, value in properties.items()
+        if inventory.comparable_kind(value) == "a number"
+    )
+    patterns = reader.patterns[configs.NODES_FILE]
+    patterns[:] = [replace(each, numbers=numbers) for each in patterns]
     nodes |= discovered.read_nodes(reader, clusters, nodes, required)
     domains = reader.read_items(
         configs.DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name"
