@@ -67,7 +67,7 @@ class MapFrame(CamelModel):
             raise ValueError(f"{known} is not a reference system that PROJ knows") from None
         if not target.is_projected or {a.unit_name for a in target.axis_info} != {"metre"}:
             raise ValueError(f"{self.crs} is not in metres; name a projected reference system")
-        if not datum.is_geographic:
+        if not datum.is_geographic or datum.axis_info[0].unit_name != "degree":
             raise ValueError(f"datum {self.datum} is not in degrees; name a geographic one")
         return pyproj.Transformer.from_crs(datum, target, always_xy=True)
 
