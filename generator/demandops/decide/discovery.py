@@ -117,7 +117,8 @@ def discover(
     keeps = timedelta(seconds=seconds_of(discovery.gone_after))
     for id in sorted(known.keys() - nodes.keys()):
         since = min(known[id].gone_since or now, now)  # the clock may have been set back
-        if now - since >= keeps and not is_needed(id):
+        is_listed = files.get(id, path) != path  # then claims need what people list
+        if now - since >= keeps and (is_listed or not is_needed(id)):
             left.append(f"{id}: taken out, as the cluster has not had it since {time_text(since)}")
             continue
         nodes[id] = known[id].model_copy(update={"gone_since": since})

@@ -123,6 +123,8 @@ def find(source: Source, name: str, kind: str | None = None) -> Thing:
     if "/" in name and _has_history(source, reader, name.rstrip("/")):
         return _by_path(source, reader, name.rstrip("/"))
     config, ledger = source.config, source.state.ledger
+    if name in config.kinds or config.unlisted.why_not(name):
+        raise StateRepoError(f"{quoted(name)} {config.why_no_node(name)}")
     known = {*source.releases, *ended, *_demands(source), *ledger.indexed_names("requester")}
     known |= {id for subject_kind in SubjectKind for id in ledger.subjects(subject_kind)}
     known |= {*config.nodes, *config.appdefs, *config.overrides, *config.domains}

@@ -16,6 +16,7 @@ import click
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.naming import id_problem
+from demandops.base.placeholders import example_of, is_pattern
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import GENERATED_ROOTS, MAIN_BRANCH
@@ -227,10 +228,13 @@ def _create(
             is_open = kind in ("applications", "connections", "requesters")
             names = [*all_names(repo, kind)]
             for pattern in patterns if not (is_open and fields.get("refuseNew")) else ():
-                if not may_match(pattern, names):
+                is_template = kind == "nodes" and is_pattern(pattern)
+                if is_template or not may_match(pattern, names):
                     what = kind.removesuffix("s")
                     hint = "; only --refuse-new can be about what nobody demands yet"
-                    message = f"no {what} is called {quoted(pattern)}{suggestion(pattern, names)}"
+                    close = suggestion(pattern, names)
+                    close = f"; write {quoted(example_of(pattern, '*'))}" if is_template else close
+                    message = f"no {what} is called {quoted(pattern)}{close}"
                     unknown.append(fault(f"--{what}", message + (hint if is_open else "")))
         if unknown:
             raise InvalidInput(unknown)
@@ -243,9 +247,14 @@ def _create(
         text = override_text(name, {**given, "select": [chosen]})
         parsed = Override.from_file(name, parse_file(OverrideFile, text, _path_of(name)))
         note = "  refuses what is new; what runs may be renewed, reduced and released"
-        more = {"override": override_data(parsed)}, [note] if parsed.refuseNew else []
+
+        def more(before: State, after: State) -> tuple[Json, list[str]]:
+            stays = relocation.following_overrides(after).stays
+            lines = [f"  {text}" for path, text in stays if path == parsed.path]
+            return {"override": override_data(parsed)}, [note] * bool(parsed.refuseNew) + lines
+
         files, branch = {parsed.path: text}, f"override/{name}"
-        person_change.commit(repo, files, summary, branch, options, lambda *_: more)
+        person_change.commit(repo, files, summary, branch, options, more)
 
 
 def _path_of(name: str) -> str:

@@ -326,7 +326,7 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
         if not config.has_node(node) and not any(
             repo.changes_node(entry.commit, node) for entry in repo.log()
         ):
-            message = f"there is no node {quoted(node)}{suggestion(node, config.nodes)}"
+            message = f"{quoted(node)} {config.why_no_node(node)}"
             faults.append(fault("--node", message))
     if faults:
         raise InvalidInput(faults)

@@ -234,9 +234,10 @@ class Config:
 
     def file_of(self, collection: str, name: str) -> str:
         # for an unknown entry, the collection's usual file
+        if (file := self.entry_files.get(collection, {}).get(name)) is not None:
+            return file
         made_by = self.unlisted.patterns.matching(name) if collection == NODES_FILE else []
-        usual = made_by[0].file if made_by else collection
-        return self.entry_files.get(collection, {}).get(name, usual)
+        return made_by[0].file if made_by else collection
 
     def place_of(self, collection: str) -> str:
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
