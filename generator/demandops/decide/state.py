@@ -317,7 +317,9 @@ def effect_on_pods(
     if was == now:  # only comments differ, which name overrides
         return ""
     live = {*new.service.live, *_ALWAYS_LIVE} if isinstance(new, ServiceRelease) else set()
-    if "restart" in now.get("reconfigure", ""):  # of the library, by a template or an override
+    # of the library, by a template or an override, else by the chart
+    reconfigure = now.get("reconfigure", "restart" if getattr(new, "restarts", False) else "")
+    if "restart" in reconfigure:
         live.discard("parameters")
     differing = {name for name in {**was, **now} if was.get(name, ABSENT) != now.get(name, ABSENT)}
     return "reconfigures" if differing <= live else "restarts"

@@ -77,6 +77,7 @@ class ServiceRelease:
     service: Service
     version: ApplicationVersion
     chart: ChartSource  # that of `version`, unless an override pins another
+    restarts: bool  # by changed `parameters`, if only the chart says what these do
     inputs: Mapping[str, tuple[InputTopic, ...]]
     outputs: Mapping[str, str]
     parameters: Mapping[str, object]

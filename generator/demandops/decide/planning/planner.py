@@ -7,6 +7,7 @@ of a commit plans the same.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -341,6 +342,8 @@ def plan(world: World, key: ReleaseKey, *, shaped: bool = True) -> Release | Non
     requesters = requesters_of(claims)
     version = version_of_service(world, service, claimed)
     topics = [topic for role_topics in inputs.values() for topic in role_topics]
+    chart = version.charts[service.chart]
+    chart_values = "\n" + config.files.get(f"{chart.folder}/values.yaml", "")
     release = ServiceRelease(
         key=key,
         name=service_name(config, service, key),
@@ -348,7 +351,8 @@ def plan(world: World, key: ReleaseKey, *, shaped: bool = True) -> Release | Non
         domain=domain,
         service=service,
         version=version,
-        chart=version.charts[service.chart],
+        chart=chart,
+        restarts=bool(re.search(r"\nreconfigure: *['\"]?restart\b", chart_values)),
         inputs=MappingProxyType(inputs),
         outputs=MappingProxyType(outputs(config, service, key, further=further)),
         parameters=MappingProxyType(parameters),
