@@ -321,11 +321,11 @@ class UnlistedNodes:
         if not at:
             node, domain, _ = self._made(id)
             return Unlisted(self._complete(node, domain), domain, id) if node else None
-        of_host, domain = self.find(host), self._domains.get(name)
-        for further in of_host.node.access_domains if of_host and domain else ():
-            if of_host and further.name == name:
-                node = of_host.node.in_domain(further)
-                return Unlisted(self._complete(node, domain), domain, host)
+        # as it is written: the ROS domain of its first access domain is not that of another
+        (written, first, _), domain = self._made(host), self._domains.get(name)
+        for further in written.access_domains if written and first and domain else ():
+            if written and further.name == name:
+                return Unlisted(self._complete(written.in_domain(further), domain), domain, host)
         return None
 
     def other_host(self, id: str) -> str | None:
@@ -335,7 +335,7 @@ class UnlistedNodes:
 
     def why_not(self, id: str) -> str:
         """Return why an id that a pattern matches is no node, or in no domain, else nothing."""
-        return self._made(id)[2]
+        return self._made(id.partition("@")[0])[2]
 
     def places(self, node: Node, clusters: Iterable[str]) -> Iterator[tuple[Node, AccessDomain]]:
         """Yield what the example of a pattern stands for, with each domain of those nodes.
