@@ -40,6 +40,7 @@ NODES, BROKERS = "inventory/nodes.yaml", "inventory/brokers.yaml"
 POLICY = "policy/access-domains.yaml"
 PATTERNS = plain_yaml.beside(__file__, "patterns")
 VEHICLE, BROKER = PATTERNS["vehicle"], PATTERNS["broker"]
+FURTHER = {"accessDomains": [{"name": "b"}]}
 
 
 def inventory(*nodes: dict[str, Any], brokers: tuple[dict[str, Any], ...] = ()) -> dict[str, str]:
@@ -62,21 +63,30 @@ def filled(part: Any, n: str) -> Any:
     return int(n) if part == "{n}" else text
 
 
+def two_domains() -> dict[str, str]:
+    """Return a policy with a further domain, of which only the first one has a ROS domain."""
+    policy = yaml.safe_load(skeleton()[POLICY])
+    policy["domains"][0]["ros"] = {"domainId": 7}
+    policy["domains"].append({"name": "b", "namespace": "b", "nodes": []})
+    return {POLICY: json.dumps(policy)}
+
+
 def test_a_pattern_means_what_the_entries_would() -> None:
-    listed = MemoryRepo(
-        inventory(
-            *({"id": f"vehicle{n}"} | filled(VEHICLE, n) for n in ("07", "8")),
-            brokers=tuple(filled(BROKER, n) for n in ("07", "8")),
-        )
-    )
-    pattern = MemoryRepo(inventory({"id": "vehicle{n}"} | VEHICLE, brokers=(BROKER,)))
+    vehicle = VEHICLE | FURTHER
+    entries = [{"id": f"vehicle{n}"} | filled(vehicle, n) for n in ("07", "8")]
+    brokers = tuple(filled(BROKER, n) for n in ("07", "8"))
+    listed = MemoryRepo(inventory(*entries, brokers=brokers) | two_domains())
+    written = inventory({"id": "vehicle{n}"} | vehicle, brokers=(BROKER,))
+    pattern = MemoryRepo(written | two_domains())
     for node in ("vehicle07", "vehicle8"):
+        assert listed.config.nodes[f"{node}@b"] == pattern.config.nodes[f"{node}@b"]
         for repo in (listed, pattern):
             repo.send(put(node, node, id="fusion", topic=(f"/vehicles/{node}/ego_data", node)))
         for known in (lambda config: config.nodes, lambda config: config.brokers):
             assert known(listed.config)[node] == known(pattern.config)[node]
     differing = {*listed.files.items()} ^ {*pattern.files.items()}
-    assert {path for path, _ in differing} == {NODES, BROKERS}
+    # the bootstrap names the listed vehicles of the further domain, or their pattern
+    assert {path for path, _ in differing} == {NODES, BROKERS, gitops.bootstrap_path("c-its")}
 
 
 def test_an_editor_accepts_placeholders_in_place_of_any_value() -> None:
@@ -124,15 +134,8 @@ def test_a_pattern_has_its_namespaces_and_its_part_of_the_rule_of_its_cluster() 
     ((cluster, domain),) = gitops.domains_in_use(config)
     rule = gitops.node_rule(cluster, domain, config)
     assert '("vin" in variables.selector && variables.selector["vin"].matches("^b\\\\.[A-Z' in rule
-    further = {
-        "id": "tram{n}",
-        "type": "tram",
-        "cluster": "c-its",
-        "accessDomains": [{"name": "b"}],
-    }
-    policy = yaml.safe_load(skeleton()[POLICY])
-    policy["domains"].append({"name": "b", "namespace": "b", "nodes": [], "ros": {"domainId": 7}})
-    config = load(configuration(inventory(further) | {POLICY: json.dumps(policy)}))
+    tram = {"id": "tram{n}", "type": "tram", "cluster": "c-its"} | FURTHER
+    config = load(configuration(inventory(tram) | two_domains()))
     ((cluster, domain), _) = gitops.domains_in_use(config)
     assert '["node_id"].matches("^tram[A-Z' in gitops.node_rule(cluster, domain, config)
 

@@ -209,15 +209,8 @@ class Config:
         """Return a node's cluster and access domain, or each that nodes of a pattern may have."""
         if not is_pattern(node.id):
             return [(node.cluster, self.domain_of[node.id])] if node.id in self.domain_of else []
-        host, _, name = node.id.partition("@")  # as written: `vehicle{n}@{area}`
-        example, places = self.node_patterns[host].example, []
-        for there, first in self.unlisted.places(example, self.clusters):
-            pairs = zip(example.access_domains, there.access_domains, strict=True)
-            named = {written.name: self.domains.get(at.name) for written, at in pairs}
-            domain = named[name] if name else first
-            if domain and (domain is not first or not name):
-                places.append((there.cluster, domain))
-        return places
+        host = node.id.partition("@")[0]
+        return self.unlisted.places_by_id(self.node_patterns[host].example, self.clusters)[node.id]
 
     def domains_at(self, node: Node) -> list[AccessDomain]:
         return [*{domain.name: domain for _, domain in self.places_of(node)}.values()]

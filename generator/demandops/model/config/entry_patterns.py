@@ -32,7 +32,7 @@ from demandops.base.placeholders import (
 )
 from demandops.base.quoting import quoted
 from demandops.model.config.base_model import faults_of, matches
-from demandops.model.config.inventory import Node
+from demandops.model.config.inventory import Node, id_in_domain
 from demandops.model.config.policy import AccessDomain
 
 Entry = TypeVar("Entry", bound=BaseModel)
@@ -313,6 +313,7 @@ class UnlistedNodes:
         complete: Callable[[Node, AccessDomain | None], Node],
     ) -> None:
         self.patterns, self._domains, self._complete = patterns, domains, complete
+        self._places: dict[str, Mapping[str, list[tuple[str, AccessDomain]]]] = {}
         self._globs = Globs((glob, name) for name, d in domains.items() for glob in d.nodes)
         self.find = lru_cache(maxsize=65_536)(self._find)
 
@@ -321,11 +322,11 @@ class UnlistedNodes:
         if not at:
             node, domain, _ = self._made(id)
             return Unlisted(self._complete(node, domain), domain, id) if node else None
-        of_host, domain = self.find(host), self._domains.get(name)
-        for further in of_host.node.access_domains if of_host and domain else ():
-            if of_host and further.name == name:
-                node = of_host.node.in_domain(further)
-                return Unlisted(self._complete(node, domain), domain, host)
+        # as it is written: the ROS domain of its first access domain is not that of another
+        (written, first, _), domain = self._made(host), self._domains.get(name)
+        for further in written.access_domains if written and first and domain else ():
+            if written and further.name == name:
+                return Unlisted(self._complete(written.in_domain(further), domain), domain, host)
         return None
 
     def other_host(self, id: str) -> str | None:
@@ -335,7 +336,7 @@ class UnlistedNodes:
 
     def why_not(self, id: str) -> str:
         """Return why an id that a pattern matches is no node, or in no domain, else nothing."""
-        return self._made(id)[2]
+        return self._made(id.partition("@")[0])[2]
 
     def places(self, node: Node, clusters: Iterable[str]) -> Iterator[tuple[Node, AccessDomain]]:
         """Yield what the example of a pattern stands for, with each domain of those nodes.
@@ -359,6 +360,26 @@ class UnlistedNodes:
             id = filled(node.id, known)
             for name in sorted({name for _, name in self._globs.overlapping(glob_of(id))}):
                 yield node.model_copy(update=there), self._domains[name]
+
+    def places_by_id(
+        self, node: Node, clusters: Iterable[str]
+    ) -> Mapping[str, list[tuple[str, AccessDomain]]]:
+        """Return each cluster and domain of the nodes of a pattern, and of those in its further
+        domains, by the id as it is written: ``vehicle{n}@{area}``.
+        """
+        if node.id not in self._places:  # there may be many
+            found = defaultdict[str, dict[tuple[str, str], tuple[str, AccessDomain]]](dict)
+            for there, first in self.places(node, clusters):
+                found[node.id][there.cluster, first.name] = there.cluster, first
+                for written, at in zip(node.access_domains, there.access_domains, strict=True):
+                    domain = self._domains.get(at.name)
+                    if domain and domain is not first:
+                        id = id_in_domain(node.id, written.name)
+                        found[id][there.cluster, at.name] = there.cluster, domain
+            self._places[node.id] = defaultdict(
+                list, {id: [*places.values()] for id, places in found.items()}
+            )
+        return self._places[node.id]
 
     def first_domain(self, id: str) -> AccessDomain | None:
         names = {name for _, name in self._globs.matching(id)}

@@ -81,7 +81,10 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         if inventory.comparable_kind(value) == "a number"
     )
     patterns = reader.patterns[configs.NODES_FILE]
-    patterns[:] = [replace(each, numbers=numbers) for each in patterns]
+    patterns[:] = [  # few have any, and each makes its example anew
+        replace(each, numbers=numbers) if numbers & {*each.data.get("properties", ())} else each
+        for each in patterns
+    ]
     nodes |= discovered.read_nodes(reader, clusters, nodes, required)
     domains = reader.read_items(
         configs.DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name"
@@ -137,10 +140,11 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         node, at = pattern.example, reader.places[configs.NODES_FILE][pattern.id]
         for further in node.access_domains:
             reader.places[configs.NODES_FILE][id_in_domain(node.id, further.name)] = at
-        places = unlisted.places(node, clusters)
-        clashes = [[*_clashes(reader, *place, domains)] for place in places]
-        for field, message in min(clashes, key=len, default=()):  # some id may have none
-            reader.add_fault(at[0], f"{at[1]}.{field}", message)
+        places = unlisted.places(node, clusters) if node.access_domains else ()
+        clashes = ([*_clashes(reader, *place, domains)] for place in places)
+        if (found := next(clashes, [])) and all(clashes):  # else some id has none
+            for field, message in found:
+                reader.add_fault(at[0], f"{at[1]}.{field}", message)
     all_nodes = {id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()}
     if node_patterns:
         all_nodes = OnDemand(all_nodes, lambda id: (made := unlisted.find(id)) and made.node)
