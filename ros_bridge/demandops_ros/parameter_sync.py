@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,12 @@ def parameters_of(node: str, text: str, file: str) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise InvalidInput([fault("", "must map nodes to their parameters").within(file)])
     name = node.lstrip("/")
-    keys = [key for key in ("/**", "**", "/*", "*", f"/{name}", name) if key in data]
+
+    def is_for_the_node(key: str) -> bool:  # to ROS, `*` is one part of a name, `**` any number
+        pattern = re.escape(f"/{key.strip('/')}").replace(r"/\*\*", "(/[^/]+)*")
+        return re.fullmatch(pattern.replace(r"/\*", "/[^/]+"), f"/{name}") is not None
+
+    keys = sorted(filter(is_for_the_node, data), key=lambda key: ("**" not in key, "*" not in key))
     if not keys:
         problem = f"has no parameters of the node; write {name}: {{{_SECTION}: …}}"
         raise InvalidInput([fault(name, problem).within(file)])

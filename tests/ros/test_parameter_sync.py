@@ -230,6 +230,8 @@ def test_a_value_gets_the_type_of_the_node() -> None:
 def test_parameters_have_dotted_names_and_a_file_that_gives_a_node_nothing_is_refused() -> None:
     text = "/**: {ros__parameters: {a: 1, b: {c: 2}}}\n/node: {ros__parameters: {b: {c: [x]}}}\n"
     assert parameters_of("node", text, "f") == {"a": 1, "b.c": ["x"]}  # a node overrides all nodes
+    text = "/f/*: {ros__parameters: {a: 2}}\n/**/n: {ros__parameters: {a: 1}}\n/*: 5\nf/m: 5\n"
+    assert parameters_of("f/n", text, "f") == {"a": 2}
     assert Parameter("b.c", value=["x"]).type_ is Parameter.Type.STRING_ARRAY
     for text, told in (
         ("- 1", "must map nodes to their parameters"),
