@@ -162,7 +162,7 @@ def test_a_thousand_nodes_and_what_a_decision_sees_of_them(
         f"{MANY} came",
         "1 changed",
         "10 changed",
-        "1 left",
+        "1 gone",
     ]
     message = git(bare, "log", "-1", "--format=%B", made[2].id)
     assert "~ bus0009: cordoned by 'kubectl-cordon'" in message

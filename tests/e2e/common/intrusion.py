@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,7 @@ def config(name: str, namespace: str) -> Manifest:
 
 def withdraw(world: World) -> None:
     """Remove the committed files that still exist, and wait until the removal is applied."""
-    commit = world.tip()
-    if left := world.git("ls-files", FILE, BASE, ELSEWHERE).split():
-        commit = world.push(dict.fromkeys(left))
-    world.domain.follow(commit)
+    while left := world.git("ls-files", FILE, BASE, ELSEWHERE).split():
+        with suppress(FileNotFoundError):  # the generator removed one meanwhile
+            world.push(dict.fromkeys(left))
+    world.domain.follow(world.tip())
