@@ -152,7 +152,8 @@ def test_a_start_at_any_commit_finds_what_the_running_generator_has(
                 assert {c.key: c for c in found.state.ledger} == {
                     c.key: c for c in running.state.ledger
                 }, files
-            assert bool(alone.problems) == bool(running.problems)
+            # what `alone` has, the generator may have put back by now
+            assert bool(again.problems) == bool(running.problems)
             with suppress(DemandOpsError):
                 rig.book(generator, goal(random.randrange(8), shutdown=random.random() < 0.4))
         gone = dict.fromkeys(GitRepo(bare).files("overrides/"))

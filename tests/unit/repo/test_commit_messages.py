@@ -10,7 +10,7 @@ from pathlib import Path
 import pygit2
 import pytest
 from demandops.base.errors import fault
-from demandops.base.naming import id_problem
+from demandops.base.naming import id_problem, one_form
 from demandops.base.quoting import harmless, is_visible, one_line
 from demandops.decide.decision import Decision
 from demandops.decide.state import ReleaseChange
@@ -165,7 +165,7 @@ NASTY = [*TEXTS["ids"], "x" * 300, "ü" * 300, "🚗" * 300]
 IDS = st.one_of(
     st.text(visible, min_size=1, max_size=60).filter(lambda text: not id_problem(text)),
     st.sampled_from(NASTY),
-)
+).map(one_form)  # as goals bring them
 
 
 @given(names=st.lists(IDS, min_size=1, max_size=3, unique=True), request=IDS, application=IDS)
