@@ -214,7 +214,7 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
             )
     topics = values.get(_TOPICS) or ()
     bridged = {
-        topic for node in config.kinds_of_nodes() for to in node.bridged.values() for topic in to
+        topic for node in config.kinds.values() for to in node.bridged.values() for topic in to
     }
     if missing := [topic for topic in topics if topic not in bridged]:
         yield (

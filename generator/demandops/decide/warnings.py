@@ -289,7 +289,7 @@ def request_warnings(config: Config) -> Iterator[Fault]:
             is_usual = name in ("cpu", "memory")
             if not any(
                 is_usual if most is None else most >= amount_of(amount)
-                for most in (node.most(name) for node in config.kinds_of_nodes())
+                for most in (node.most(name) for node in config.kinds.values())
             ):
                 message = (
                     f"service '{service.name}' requests {known}; no node of the inventory has as "
@@ -386,7 +386,7 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
                 message = f"{quoted(entry.id)} matches what {twin} does, so neither gives anything"
                 place = f"{field_path(entry.place)}.{entry.key}"
                 yield fault(place, f"{message}; remove one of them").within(entry.file)
-    kinds_of_nodes = sorted(config.kinds_of_nodes(), key=lambda node: node.id)
+    kinds_of_nodes = sorted(config.kinds.values(), key=lambda node: node.id)
     nodes = tuple(node.id for node in kinds_of_nodes)
     brokers = (*config.brokers, *config.broker_patterns)
     for name, domain in sorted(config.domains.items()):
@@ -457,7 +457,7 @@ def policy_warnings(world: State) -> Iterator[Fault]:
         field = "place" if service.shared else f"services.{name}.place"
         requirement = requirement_of(service)
         problems = [*unmet(requirement, config)]
-        if not problems and all(any(lacks(node, requirement)) for node in config.kinds_of_nodes()):
+        if not problems and all(any(lacks(node, requirement)) for node in config.kinds.values()):
             problems = [f"no node in {config.place_of(NODES_FILE)} meets all requirements"]
         for problem in problems:
             message = f"{problem}, so demands that need '{name}' are refused"
@@ -506,7 +506,7 @@ def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
     nodes = [
         (domain.name, node.id, cluster, node)
-        for node in config.kinds_of_nodes()
+        for node in config.kinds.values()
         if node.host_network
         for cluster, domain in config.places_of(node)
     ]

@@ -54,7 +54,7 @@ def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
     """Return (cluster, access domain) for each domain with nodes in the cluster, sorted."""
     pairs = {
         (cluster, domain.name)
-        for node in config.kinds_of_nodes()
+        for node in config.kinds.values()
         for cluster, domain in config.places_of(node)
     }
     return [(cluster, config.domains[name]) for cluster, name in sorted(pairs)]
@@ -277,7 +277,7 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
     by_label: dict[str, set[str]] = {}
     selectors: set[tuple[tuple[str, str], ...]] = set()
     by_pattern = list[str]()
-    for node in config.kinds_of_nodes():
+    for node in config.kinds.values():
         if node.selector is None or (cluster, domain) not in config.places_of(node):
             continue
         if is_pattern(node.id):

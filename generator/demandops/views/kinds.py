@@ -541,7 +541,7 @@ def _nodes(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
         for id in nodes_of(claim):
             needing[id].append(claim)
     # A claim may need a node that a person removed from the inventory.
-    for id in sorted({*(node.id for node in source.config.kinds_of_nodes()), *needing}):
+    for id in sorted({*source.config.kinds, *needing}):
         yield id, (id, needing[id], _runs(source, sorted(running[id])))
 
 
@@ -590,7 +590,7 @@ def _quotas(item: Json, now: datetime) -> list[str]:
 def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     nodes: defaultdict[str, list[str]] = defaultdict(list)
     clusters: defaultdict[str, set[str]] = defaultdict(set)
-    for node in sorted(source.config.kinds_of_nodes(), key=lambda node: node.id):
+    for node in sorted(source.config.kinds.values(), key=lambda node: node.id):
         for cluster, domain in source.config.places_of(node):
             nodes[domain.name].append(node.id)
             clusters[domain.name].add(cluster)

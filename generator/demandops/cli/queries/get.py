@@ -247,7 +247,7 @@ def _refuse_unknown(
     # a filter may match no item if it names something that exists, such as a node without demands
     ledger, config = source.state.ledger, source.config
     existing: dict[str, Iterable[str]] = {
-        "node": {*(node.id for node in config.kinds_of_nodes()), *ledger.indexed_names("node")},
+        "node": {*config.kinds, *ledger.indexed_names("node")},
         "domain": config.domains,
         "requester": ledger.indexed_names("requester"),
         "application": ledger.subjects(SubjectKind.APPLICATION),

@@ -314,9 +314,9 @@ class Choice:
         shown = [text for *_, text in nsmallest(_MOST_SHOWN, misses)]
         hidden = len(misses) - len(shown)
         more = [f"{hidden} more {'are' if hidden > 1 else 'is'} not shown"] if hidden else []
-        nothing = "the inventory lists none" + bool(self.config.node_patterns) * (
-            ", and one of a pattern is used only where a demand names it"
-        )
+        nothing = "the inventory lists none"
+        if self.config.node_patterns:
+            nothing += ", and one of a pattern is used only where a demand names it"
         message = f"{what}no node fits: {'; '.join([*shown, *more]) or nothing}"
         less = f"change 'place' in {self.service.file}" if self.service else "ask for less"
         message += f"; {less}, or ask for a change of {' or '.join(places)}"
@@ -326,7 +326,7 @@ class Choice:
 
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
     """Yield a message for each part of a requirement that no node of the inventory can meet."""
-    role, roles = requirement.role, {node.type for node in config.kinds_of_nodes()}
+    role, roles = requirement.role, {node.type for node in config.kinds.values()}
     if role and role not in roles:
         yield f"no node has the role {quoted(role)}{suggestion(role, roles)}"
     kinds = config.property_kinds

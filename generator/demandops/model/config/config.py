@@ -182,10 +182,6 @@ class Config:
         channels = {"": listed.default, **listed.channels}
         return versions | {channel: versions[name] for channel, name in channels.items()}
 
-    def kinds_of_nodes(self) -> Iterable[Node]:
-        """Return each listed node, and those that stand for all nodes of each pattern."""
-        return self.kinds.values()
-
     def has_node(self, pattern: str) -> bool:
         """Return whether a node has this name, or may match this pattern with ``*`` and ``?``."""
         if "*" in pattern or "?" in pattern:

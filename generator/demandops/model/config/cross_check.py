@@ -66,7 +66,7 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
 
 def _nodes(config: Config, reader: ConfigReader) -> Iterator[tuple[Node, str, str]]:
     """Yield each kind of node with its file and place, also what nodes of clusters have besides."""
-    for node in config.kinds_of_nodes():
+    for node in config.kinds.values():
         yield node, *reader.places[configs.NODES_FILE][node.id]
     for pattern in reader.of_clusters:
         entry = pattern.example.model_copy(update={"bridged": {}})  # its peers may come with it
