@@ -94,6 +94,12 @@ _TAGS = {
 }
 
 
+# How many characters a key may have as :func:`to_json` writes it: YAML ends such keys there. An
+# escape has up to six.
+_LONGEST_KEY = 1024
+_MOST_UNCHECKED = 128
+
+
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
     return yaml.constructor.ConstructorError(None, None, what, at.start_mark)
 
@@ -143,6 +149,9 @@ class Loader(_CLoader):  # type: ignore[misc]
             if not isinstance(key, str):  # Helm reads the key `on` as true
                 shown = getattr(event, "value", "") or short_repr(key)
                 raise _problem(f"the key {shown} must be text; put it in quotes", event)
+            if len(key) > _MOST_UNCHECKED and len(to_json(key)) > _LONGEST_KEY:
+                message = f"a key has more than {_LONGEST_KEY} characters; shorten it"
+                raise _problem(message, event)
             if key == "<<" and event.implicit[0]:
                 raise _problem("'<<' is not allowed; write the fields out", event)
             if key in mapping:  # parsers differ in which of the two counts

@@ -177,7 +177,7 @@ def _type_field() -> PlainValidator:
     word = type_word("auto")
 
     def read(value: object) -> ConnectionType | None:
-        if value is None or isinstance(value, ConnectionType):
+        if isinstance(value, ConnectionType):
             return value
         checked = word.func(value)  # type: ignore[call-arg]
         return None if checked == "auto" else type_named(str(checked))

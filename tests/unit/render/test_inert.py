@@ -249,6 +249,14 @@ def test_a_key_is_text_or_a_fault() -> None:
             strict_yaml.load(f"? {key}\n: 1")
 
 
+@pytest.mark.parametrize("char", ["x", "\x7f"])
+def test_a_key_is_too_long_if_it_could_not_be_written_in_json(char: str) -> None:
+    longest = char * ((1024 - 2) // len(strict_yaml.to_json(char)[1:-1]))
+    assert strict_yaml.load(f"a: {strict_yaml.to_json({longest: 1})}") == {"a": {longest: 1}}
+    with pytest.raises(InvalidInput, match="a key has more than 1024 characters; shorten it"):
+        strict_yaml.load(strict_yaml.dump({longest + char: 1}))
+
+
 NUMBERS = st.integers() | st.floats(allow_nan=False, allow_infinity=False)
 WORDS = [
     *HELM_READS,
@@ -262,7 +270,7 @@ DATA = st.recursive(
     LISTS | st.sampled_from([*WORDS, *STAND_INS, *LONG]) | st.none() | NUMBERS,
     lambda inner: (
         st.lists(inner, max_size=3)
-        | st.dictionaries(st.sampled_from(["a", "b", *WORDS, *STAND_INS, *LONG]), inner, max_size=3)
+        | st.dictionaries(st.sampled_from(["a", "b", *WORDS, *STAND_INS, *LONG[:3]]), inner, max_size=3)
     ),
     max_leaves=6,
 )
