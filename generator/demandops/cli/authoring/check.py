@@ -150,9 +150,7 @@ _MOST_DIFF_LINES_JSON = 20_000
 )
 @output_formats("text", "json", "markdown")
 def check(directory: Path, base: str | None, require_helm: bool, output: str) -> None:
-    """Check edits of a state repo and show their consequences.
-
-    DIR is a checked-out state repo; default: this folder. The files of DIR must be valid, every
+    """DIR is a checked-out state repo; default: this folder. The files of DIR must be valid, every
     application must render, no generated file may be edited, and a changed chart needs a new
     version. If a generated file is edited, the command prints the override to write instead. Helm
     lints the charts, and renders them for the current releases and for an example of each

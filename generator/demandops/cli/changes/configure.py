@@ -98,8 +98,7 @@ until_option = click.option(
 
 @click.group()
 def override() -> None:
-    """Create and end overrides: deviations that people declare.
-
+    """
     \b
     Examples:
       demandops override create calm --node edge --hold -m "Demonstration"
@@ -304,9 +303,7 @@ def name_of(selected: Mapping[str, tuple[str, ...]]) -> str:
 @until_option
 @editing
 def suspend(expires: str | None, options: Options, **selected: tuple[str, ...]) -> None:
-    """Stop applications and connections; their claims stay booked.
-
-    Nothing runs for these claims, and new demands that match the options are refused. To end the
+    """Nothing runs for these claims, and new demands that match the options are refused. To end the
     suspension, give `demandops resume` the same selection, such as --requester vehicle00. The
     command creates an override with `deny` in your own name.
 
@@ -340,10 +337,8 @@ def described(selected: Mapping[str, tuple[str, ...]]) -> str:
 @selecting
 @editing
 def resume(name: str | None, options: Options, **selected: tuple[str, ...]) -> None:
-    """Run suspended applications and connections again.
-
-    Give the same selection as for `demandops suspend`, such as --requester vehicle00, or NAME, the
-    override's name. The command ends this override.
+    """Give the same selection as for `demandops suspend`, such as --requester vehicle00, or NAME,
+    the override's name. The command ends this override.
 
     \b
     Examples:
@@ -424,11 +419,9 @@ _node = click.argument("node", metavar="NODE", shell_complete=names_of("nodes"))
 @_node
 @editing
 def drain(node: str, options: Options) -> None:
-    """Take a node out of use: the generator places nothing there.
-
-    The command sets `drained: true` in the inventory. The generator then moves away what it placed
-    on the node, and places nothing there. What a demand names the node for stays, and such demands
-    are still accepted; an override with `--on` moves it, and `demandops release` ends it.
+    """The command sets `drained: true` in the inventory. The generator then moves away what it
+    placed on the node, and places nothing there. What a demand names the node for stays, and such
+    demands are still accepted; an override with `--on` moves it, and `demandops release` ends it.
 
     \b
     Examples:
@@ -443,9 +436,8 @@ def drain(node: str, options: Options) -> None:
 @_node
 @editing
 def undrain(node: str, options: Options) -> None:
-    """Use a drained node again.
-
-    The command takes `drained: true` out of the inventory. What was moved away stays where it is.
+    """The command takes `drained: true` out of the inventory. What was moved away stays where it
+    is.
 
     \b
     Examples:
@@ -461,10 +453,8 @@ def undrain(node: str, options: Options) -> None:
 @click.argument("commit", metavar="COMMIT")
 @editing
 def revert(commit: str, options: Options) -> None:
-    """Undo a person's commit, by a new commit.
-
-    The files that COMMIT changed become what they were before it. If a file has changed since, the
-    command changes nothing. A generator's commit is undone by `demandops release` or `demandops
+    """The files that COMMIT changed become what they were before it. If a file has changed since,
+    the command changes nothing. A generator's commit is undone by `demandops release` or `demandops
     rollback`, because later demands may build on it.
 
     \b

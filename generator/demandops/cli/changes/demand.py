@@ -114,13 +114,11 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Demand what files ask for: book it, or send it to a node.
-
-    FILE contains documents of the kind Demand (docs/demand.md), or goals of the action
+    """FILE contains documents of the kind Demand (docs/demand.md), or goals of the action
     DeploymentRequest as YAML, as for `ros2 action send_goal`. Write - for standard input. With a
     state repo at hand, the command books directly in it; otherwise, and with --via ros, it sends
-    the goals over ROS 2 to a running node. If it cannot parse one of the
-    documents, it takes none. Otherwise it takes the documents in order, also if one is refused.
+    the goals over ROS 2 to a running node. If it cannot parse one of the documents, it takes none.
+    Otherwise it takes the documents in order, also if one is refused.
 
     \b
     Examples:

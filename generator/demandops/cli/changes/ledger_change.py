@@ -234,9 +234,7 @@ def _only(kind: str, other: str) -> Callable[..., Any]:
 @_only("application", "demand")
 @changing()
 def release(name: str, kind: str | None, options: Options) -> None:
-    """Stop one demand, or an application for all who demand it.
-
-    DEMAND is the id of a demand or of its request, or the start of a demand's id: all its claims
+    """DEMAND is the id of a demand or of its request, or the start of a demand's id: all its claims
     are released, also if it waits for room. Of an APPLICATION, the claims of all demands are
     released; what else these demands hold stays. What others need runs on. Whoever demands it again
     gets it again: to keep it from running, see `demandops suspend`.
@@ -255,9 +253,7 @@ def release(name: str, kind: str | None, options: Options) -> None:
 @_only("requester", "node")
 @changing()
 def decommission(name: str, kind: str | None, options: Options) -> None:
-    """Release all claims of a node or a requester.
-
-    For a node, the command releases the applications on the node, the inputs that come from the
+    """For a node, the command releases the applications on the node, the inputs that come from the
     node, the deliveries to the node, and the connections from and to the node, for every requester.
     Then you can delete the node from the inventory. For a requester, the command releases all
     claims of this requester, even claims that also name other requesters. It also ends the waiting
@@ -299,13 +295,11 @@ _MOST_EDITS = 5
 def rollback(
     revision: str, demand: str, application: str, drop_newer: bool, options: Options
 ) -> None:
-    """Restore the claims of an earlier commit, by a new commit.
-
-    Claims that were released after the earlier commit are booked again, with the current
-    configuration. Claims that were booked or changed after it prevent the rollback, unless
-    you give --drop-newer. The lease of a restored claim starts again with its full term. REV is a
-    commit. TIME selects the newest commit at or before this time. Without both, --demand or
-    --application means the commit before its last change.
+    """Claims that were released after the earlier commit are booked again, with the current
+    configuration. Claims that were booked or changed after it prevent the rollback, unless you give
+    --drop-newer. The lease of a restored claim starts again with its full term. REV is a commit.
+    TIME selects the newest commit at or before this time. Without both, --demand or --application
+    means the commit before its last change.
 
     \b
     Examples:

@@ -339,9 +339,7 @@ def _proposal(repo: Reader, name: str, commit: str, output: str) -> PendingPropo
 @_named
 @_answering
 def approve(name: str, commit: str, options: Options) -> None:
-    """Approve a proposal: merge its branch in your own name.
-
-    At a terminal, the command first shows what the merge would change, and asks. Elsewhere, and
+    """At a terminal, the command first shows what the merge would change, and asks. Elsewhere, and
     with --yes, name the commit that you looked at: --commit ID. If the branch is at another commit,
     the command merges nothing. The generator then answers the demand and removes the branch. If
     main has changed the same files since the proposal was made, the command merges nothing either.
@@ -392,9 +390,7 @@ def approve(name: str, commit: str, options: Options) -> None:
 @_named
 @_answering
 def reject(name: str, commit: str, options: Options) -> None:
-    """Reject a proposal: delete its branch, and record who and why.
-
-    The requester gets the reason, which must be given; the generator aborts the goal with
+    """The requester gets the reason, which must be given; the generator aborts the goal with
     `turned-down`. If the branch has changed since the command read it, the command changes nothing.
 
     \b

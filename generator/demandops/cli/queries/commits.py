@@ -45,9 +45,7 @@ from demandops.views.vocabulary import commit_data
 @at_option
 @output_formats("text", "wide", "json")
 def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
-    """Show who requests which service and connection.
-
-    What one of them holds: demandops get demands --requester NAME, and demandops get requesters.
+    """What one of them holds: demandops get demands --requester NAME, and demandops get requesters.
 
     \b
     Examples:
@@ -85,10 +83,8 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
 @state_repo_option
 @output_option
 def diff(before: str, after: str, state_repo: str, output: str) -> None:
-    """Show the differences between two commits.
-
-    The command compares the bookkeeping, the releases and other files below clusters/. A and B are
-    commits, or times like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
+    """The command compares the bookkeeping, the releases and other files below clusters/. A and B
+    are commits, or times like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
     Without B, it shows what has changed since A.
 
     \b
@@ -252,10 +248,9 @@ def log(
     output: str,
     **given: Any,  # noqa: ANN401 - the filters
 ) -> None:
-    """List the commits of the state repo, newest first.
-
-    If you give several filters, a commit must match all of them. REV, A and B are commits, or times
-    written as for --since. -o wide adds the absolute times, operations, authors and request ids.
+    """If you give several filters, a commit must match all of them. REV, A and B are commits, or
+    times written as for --since. -o wide adds the absolute times, operations, authors and request
+    ids.
 
     \b
     Examples:

@@ -118,9 +118,7 @@ def get(
     output: str,
     **asked: Any,  # noqa: ANN401 - the other options
 ) -> None:
-    """List demands, releases, nodes, overrides and so on.
-
-    KIND is demands, applications, releases, services, connections, leases, requesters, nodes,
+    """KIND is demands, applications, releases, services, connections, leases, requesters, nodes,
     domains, appdefs, claims, overrides, proposals or events. A proposal is a branch that a person
     merges to approve its demands, or deletes to refuse them. NAME and the values of filters may be
     patterns with * and ?. If you give several filters, an item must match all of them. The state of

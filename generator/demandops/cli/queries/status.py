@@ -71,10 +71,8 @@ def status(
     request_timeout: int,
     output: str,
 ) -> None:
-    """Show the state of each release on its cluster.
-
-    The state is the commit that the cluster has applied, and the health of the release. The state
-    of a cluster without a kubeconfig in --clusters is unknown.
+    """The state is the commit that the cluster has applied, and the health of the release. The
+    state of a cluster without a kubeconfig in --clusters is unknown.
 
     \b
     The exit code is 1 if
@@ -224,9 +222,7 @@ def amiss(source: Source, clusters: Mapping[str, ClusterAccess]) -> str:
 def reconcile(
     cluster: str | None, every: bool, state_repo: str, access_file: Path | None, output: str
 ) -> None:
-    """Let Flux or Argo CD fetch now, and not at its next interval.
-
-    The controller is woken as --clusters says: by its webhook, or by the cluster's API.
+    """The controller is woken as --clusters says: by its webhook, or by the cluster's API.
 
     \b
     Examples:
@@ -274,10 +270,8 @@ _OTHER_LINES = 6
 @state_repo_option
 @clusters_option
 def watch(state_repo: str, access_file: Path | None) -> None:
-    """Show releases, demands and the latest commits live.
-
-    Releases that are not healthy come first. The health is known only with --clusters. Ctrl-C ends
-    the command.
+    """Releases that are not healthy come first. The health is known only with --clusters. Ctrl-C
+    ends the command.
 
     \b
     Examples:
@@ -360,10 +354,8 @@ def _part(title: str, table: Table, width: int, room: int) -> list[str]:
     "current.",
 )
 def web(state_repo: str, listen: str, access_file: Path | None, interval: float) -> None:
-    """Show the state repo on a web page.
-
-    The page follows the state repo. It shows what is not ready and why, a map, lists, a time line,
-    each release, and overrides. It changes nothing. Stop it with Ctrl-C or SIGTERM.
+    """The page follows the state repo. It shows what is not ready and why, a map, lists, a time
+    line, each release, and overrides. It changes nothing. Stop it with Ctrl-C or SIGTERM.
 
     \b
     Examples:

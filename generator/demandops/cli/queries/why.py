@@ -186,9 +186,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:
-    """Explain why something runs or ran, and who decided it.
-
-    The command shows the requesters, the configuration and overrides that apply, open proposals,
+    """The command shows the requesters, the configuration and overrides that apply, open proposals,
     who approved or rejected, and the commits. NAME is the name of a thing of any kind that --kind
     lists. A part of a release's name or the start of a demand's id is enough if no other release or
     demand has it. PATH is a file in a folder of the state repo, such as clusters/ or ledger/. If
@@ -227,11 +225,9 @@ def may(
     state_repo: str,
     output: str,
 ) -> None:
-    """Say whether a requester may demand an application, and why.
-
-    APPLICATION is an application definition, or an application that is demanded now. The answer is
-    that of policy, quotas and overrides; it does not look for room on the node. The exit code is 0
-    for yes, and 1 for no.
+    """APPLICATION is an application definition, or an application that is demanded now. The answer
+    is that of policy, quotas and overrides; it does not look for room on the node. The exit code is
+    0 for yes, and 1 for no.
 
     \b
     Examples:
