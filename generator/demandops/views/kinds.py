@@ -16,12 +16,7 @@ from demandops.base.naming import SubjectKind
 from demandops.base.placeholders import is_pattern, texts
 from demandops.cluster.health import Health
 from demandops.cluster.rollouts import ReleaseStatus
-from demandops.decide.bookkeeping import (
-    carried_topics,
-    connection_entry,
-    service_entry,
-    versions_asked,
-)
+from demandops.decide import bookkeeping
 from demandops.decide.planning.overrides import suspended_by
 from demandops.decide.planning.planner import running_version
 from demandops.model.config.base_model import duration_text, parse_file, parse_time, relative
@@ -432,8 +427,8 @@ def _release(
         own = {
             "version": release.chart.version,
             "application_version": release.version.name or None,
-            "versions_asked": versions_asked(release, source.active.ledger),
-            **service_entry(source.active, release),
+            "versions_asked": bookkeeping.versions_asked(release, source.active.ledger),
+            **bookkeeping.service_entry(source.active, release),
         }
     else:
         own = {"version": None, "application_version": None, "versions_asked": {}}
@@ -470,7 +465,7 @@ def _connections(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 
 def _connection(source: Source, claims: tuple[Claim, ...], runs: Json) -> Json:
-    entry = connection_entry(claims)
+    entry = bookkeeping.connection_entry(claims)
     nodes = [entry["source"], entry["target"]]
     return {
         "name": claims[0].subject.id,
@@ -667,7 +662,9 @@ _TERM = _text("term", "Term", 3, lambda item: duration_text(item["lease"]["secon
 _REASON = _text(
     "reason", "Reason", 1, lambda item: ": ".join(filter(None, (item["object"], item["reason"])))
 )
-_TOPICS = _text("topics", "Topics", 5, lambda item: _asked_topics(carried_topics(item), item))
+_TOPICS = _text(
+    "topics", "Topics", 5, lambda item: _asked_topics(bookkeeping.carried_topics(item), item)
+)
 _SUSPENDED_BY = _text(
     "suspended_by",
     "Suspended by",
@@ -744,7 +741,7 @@ KINDS: dict[str, Kind] = {
             _connections,
             _connection,
             lambda item: {
-                "topic": carried_topics(item),
+                "topic": bookkeeping.carried_topics(item),
                 "from": [item["source"]],
                 "to": [item["target"]],
             },

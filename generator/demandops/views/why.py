@@ -39,18 +39,10 @@ from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.repo.load import ledger_files
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
-from demandops.views import kinds
+from demandops.views import kinds, vocabulary
 from demandops.views.kinds import effect_texts, nodes_of
 from demandops.views.source import Source, by_booking
-from demandops.views.vocabulary import (
-    Json,
-    commit_data,
-    override_data,
-    place_data,
-    proposal_data,
-    subject_data,
-    time_data,
-)
+from demandops.views.vocabulary import Json
 
 # ---- which thing a name means ----
 
@@ -231,7 +223,7 @@ def explain(source: Source, thing: Thing, most: int = 10) -> Json:
         "name": thing.name,
         "also": list(thing.also),
         "file": thing.path or None,
-        "proposals": [proposal_data(proposal) for proposal in _proposals(source, thing)],
+        "proposals": [vocabulary.proposal_data(proposal) for proposal in _proposals(source, thing)],
         **_EXPLAINED[thing.kind](source, thing),
         **_past(source, reader, thing, most),
     }
@@ -280,12 +272,12 @@ def _release(source: Source, thing: Thing) -> Json:
                 {"file": file, "entry": entry or None, "what": what}
                 for file, entry, what in shaping_files(release, source.config)
             ],
-            "overrides": [override_data(*each) for each in release.shaping.by],
+            "overrides": [vocabulary.override_data(*each) for each in release.shaping.by],
         }
     for release, override in source.denied:
         if release.name == thing.name:
-            denied = override_data(override, ("deny",))
-            return {"state": "denied", **place_data(release), "denied_by": denied}
+            denied = vocabulary.override_data(override, ("deny",))
+            return {"state": "denied", **vocabulary.place_data(release), "denied_by": denied}
     return {"state": "gone"}
 
 
@@ -318,7 +310,7 @@ def _subject(source: Source, thing: Thing) -> Json:
         what = f"{word} {what} from {connection.source} to {connection.target}".lstrip()
     held = _held(source, claims)
     state = "runs" if held["state"] == "held" else held["state"]
-    return {**held, "state": state, "what": what, "subject": subject_data(subject)}
+    return {**held, "state": state, "what": what, "subject": vocabulary.subject_data(subject)}
 
 
 def _demand(source: Source, thing: Thing) -> Json:
@@ -326,7 +318,7 @@ def _demand(source: Source, thing: Thing) -> Json:
     answer = _held_where(source, f"demand '{name}'", lambda claim: claim.demand == name)
     if waiting := source.state.ledger.waiting.get(name):
         answer |= {"state": "waiting", "requesters": list(waiting.requesters)}
-        answer |= {"file": waiting_path(name), "since": time_data(waiting.since)}
+        answer |= {"file": waiting_path(name), "since": vocabulary.time_data(waiting.since)}
     return answer
 
 
@@ -344,7 +336,7 @@ def _claim(source: Source, thing: Thing) -> Json:
     claim = ledger_files.claim_in(thing.path, source.state.ledger)
     if claim is None:
         return {"state": "gone"}
-    of_claim = {"what": str(claim.subject), "subject": subject_data(claim.subject)}
+    of_claim = {"what": str(claim.subject), "subject": vocabulary.subject_data(claim.subject)}
     return _held(source, [claim]) | of_claim
 
 
@@ -370,7 +362,7 @@ def _override(source: Source, thing: Thing) -> Json:
     entry = next((e for e in source.overrides if e.override.name == thing.name), None)
     if entry is None:
         return {"state": "gone"}
-    data = override_data(entry.override)
+    data = vocabulary.override_data(entry.override)
     held = _held(source, [*entry.claims], affected_releases(entry, source.state))
     what = f"{', '.join(effect_texts(data))}, of {data['owner']}: {data['reason']}"
     return {**held, "state": entry.state, "what": what}
@@ -479,7 +471,9 @@ def _past(source: Source, reader: Reader, thing: Thing, most: int) -> Json:
         if entry is None:
             return None
         behind = reader.person_commits_behind(entry, most=5)
-        return commit_data(entry) | {"carries_out": [commit_data(commit) for commit in behind]}
+        return vocabulary.commit_data(entry) | {
+            "carries_out": [vocabulary.commit_data(commit) for commit in behind]
+        }
 
     return {
         "started": row(history.started),

@@ -14,6 +14,7 @@ from pathlib import Path
 import click
 
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
+from demandops.base.quoting import count
 from demandops.base.runtime import REAL
 from demandops.cli.formats import Table, list_table, output_formats, output_option, show
 from demandops.cli.output import busy, errors, painted, read_by, warn_of_not_rendered
@@ -121,7 +122,7 @@ def status(
         }
         text: list[str | Table] = [f"  {problem}" for problem in source.problems]
         if text:
-            text.insert(0, "1 problem:" if len(text) == 1 else f"{len(text)} problems:")
+            text.insert(0, f"{count(len(text), 'problem')}:")
         if source.snapshot.faults:
             text.append(in_effect(repo, source.snapshot))
     rows = rows_of(source, "releases")
