@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import random
+import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -14,6 +16,14 @@ from pathlib import Path
 from typing import Any
 
 _CHUNKED = ("Transfer-Encoding", "chunked")
+
+
+def free_port() -> int:
+    """Return a port that no server has, and that Linux gives to no socket by itself."""
+    while True:
+        port = random.randint(61_000, 65_535)
+        with suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            return port
 
 
 @dataclass(frozen=True)
@@ -77,9 +87,9 @@ def serving(answer: Callable[[Call], Answer] | None = None, port: int = 0) -> It
         def _serve(self) -> None:
             length = int(self.headers.get("Content-Length") or 0)
             call = Call(self.command, self.path, self.headers, self.rfile.read(length))
-            with lock:
-                served.calls.append(call)
+            with lock:  # who sees the call may change what is answered to the next
                 given = served.answer(call)
+                served.calls.append(call)
             is_whole = isinstance(given.body, bytes)
             size = ("Content-Length", str(len(given.body))) if is_whole else _CHUNKED
             self.send_response(given.status)

@@ -14,7 +14,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -51,10 +51,11 @@ def reserved() -> Iterator[int]:
     random.shuffle(domains)
     for domain in domains:
         path = Path(tempfile.gettempdir()) / f"ros-domain-{domain}.lock"
-        with path.open("w") as lock:
-            try:
+        with ExitStack() as stack:
+            try:  # another user's file cannot be opened
+                lock = stack.enter_context(path.open("w"))
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            except (BlockingIOError, PermissionError):
                 continue
             if _is_free(domain):
                 yield domain

@@ -20,7 +20,7 @@ from playwright.sync_api import Browser, Route, expect
 
 from tests.kit import repo
 from tests.kit.browser import Visit, chromium
-from tests.kit.http import Answer, serving
+from tests.kit.http import Answer, free_port, serving
 from tests.kit.limits import PATIENCE_S
 from tests.kit.rig import book
 from tests.page.story import FAILING, Story, leased, released, story
@@ -229,7 +229,7 @@ def test_the_page_follows_again_when_its_server_is_back(browser: Browser, fleet:
     def serve(address: str) -> WebServer:
         return WebServer(address, "--listen", Follower(Reader.of(str(fleet.bare)), {}, 0))
 
-    server = serve("127.0.0.1:0")
+    server = serve(f"127.0.0.1:{free_port()}")
     visit = Visit(browser, server.url.rstrip("/"))
     page, address = visit.open("/demands"), urlsplit(server.url).netloc
     expect(page.locator("#live")).to_have_text("live")

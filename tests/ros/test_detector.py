@@ -35,7 +35,7 @@ def rules_of(**fields: Any) -> str:
     demand["applications"][0]["id"] = "edge/near-{entity}"
     near = {"source": "vehicles", "point": {"x": 0.0, "y": 0.0}, "start": 84, "stop": 90}
     rule = {"name": "near", "near": near, "demand": demand, "retry": "1s"}
-    sources = {"vehicles": {"topic": "/vehicles/{entity}/pose", "type": POSE}}
+    sources = {"vehicles": {"topic": "/vehicles/{entity}/pose", "type": POSE, "timeout": "1h"}}
     return text_of(rule | fields, sources=sources)
 
 
@@ -67,6 +67,7 @@ def test_who_comes_near_demands_until_it_leaves_and_rules_are_reloaded(
         return {*served.bookkeeping().get("demands", {})}
 
     client.wait(lambda: served.log.read_text().count("unknown-node") > 4)  # it tries again
+    client.wait(lambda: detecting.log.read_text().count("unknown-node") > 1)  # also of the other
     assert detecting.log.read_text().count("unknown-node") == 2, "each refusal is logged once"
     names = ["demandops_detector_client", "watcher"]
     client.wait(lambda: {*names} <= {*client.node.get_node_names()})
