@@ -262,12 +262,10 @@ def application(  # noqa: PLR0913 - as many as options
     known = (*config.domain_of, *config.example_nodes())
     nodes = sorted(known, key=lambda id: (config.nodes[id].type != "edge", id))
     if not (node or nodes):
-        raise StateRepoError(
-            "the inventory has no node in an access domain, so no demand can be made; add one "
-            "first, in inventory/nodes.yaml"
-        )
+        message = "the inventory has no node in an access domain, so no demand can be made"
+        raise StateRepoError(f"{message}; add one first, in inventory/nodes.yaml")
     node = node or nodes[0]
-    description = description or f"Runs {', '.join(service.name for service in services)}"
+    description = description or f"Runs {', '.join(names)}"
     files = _application_files(name, description, types, services, image, config)
     path = f"appdefs/{name}/demand.yaml"
     files[path], is_allowed = _example_demand(path, name, types, node, config)
@@ -385,11 +383,9 @@ def _application_files(
                 f'    "{parameter}": {modules[role]},' for role, parameter in parameters.items()
             ),
         }
-        for path, template in (
-            (f"values/{service.name}.yaml.j2", "values.yaml.j2"),
-            (f"nodes/{service.name}.py", "example-node"),
-        ):
-            files[f"{root}/{path}"] = _filled(texts[template], given | own)
+        values, node = f"{root}/values/{service.name}.yaml.j2", f"{root}/nodes/{service.name}.py"
+        files[values] = _filled(texts["values.yaml.j2"], given | own)
+        files[node] = _filled(texts["example-node"], given | own)
         inputs = {service.role: f"{service.name}.{_RESULT}"}
         types_of = {service.role: next(iter(types.values()))}  # the example passes these on
     fields = {
