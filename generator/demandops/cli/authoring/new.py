@@ -145,7 +145,6 @@ def image(name: str, repository: str, state_repo: str, directory: Path, output: 
 # each further service reads the outputs of the service before it. One image contains the nodes of
 # all services. What demands decide of a node is a ROS parameter, and changes while the node runs.
 
-_INPUT = re.compile(r"(?P<role>[^=]+)=(?P<type>.+)")
 _TYPE = re.compile(r"(?P<package>[A-Za-z]\w*)(/msg)?/(?P<name>[A-Za-z]\w*)", re.ASCII)
 _SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
 
@@ -162,13 +161,14 @@ class _Service:
 
 
 def _input(text: str) -> tuple[str, str]:
-    if not (match := _INPUT.fullmatch(text)):
+    role, _, type = text.partition("=")
+    if not (role and type):
         raise ValueError(f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image")
-    type = _TYPE.fullmatch(match["type"])
-    full = f"{type['package']}/msg/{type['name']}" if type else "package/msg/Name"
-    if match["type"] != full:
-        raise ValueError(f"'{text}' has no message type of ROS 2; write {match['role']}={full}")
-    return match["role"], full
+    match = _TYPE.fullmatch(type)
+    full = f"{match['package']}/msg/{match['name']}" if match else "package/msg/Name"
+    if type != full:
+        raise ValueError(f"'{text}' has no message type of ROS 2; write {role}={full}")
+    return role, full
 
 
 def _service(text: str) -> _Service:
