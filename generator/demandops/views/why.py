@@ -34,7 +34,7 @@ from demandops.repo.load import ledger_files
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
 from demandops.views import kinds, vocabulary
-from demandops.views.kinds import effect_texts, nodes_of
+from demandops.views.kinds import effect_texts
 from demandops.views.source import Source, by_booking
 from demandops.views.vocabulary import Json
 
@@ -335,7 +335,7 @@ def _claim(source: Source, thing: Thing) -> Json:
 def _node(source: Source, thing: Thing) -> Json:
     node, domain = source.config.nodes.get(thing.name), source.config.domain_of.get(thing.name)
     running = (release for release in source.releases.values() if release.node.id == thing.name)
-    claims = _claims_where(source, lambda claim: thing.name in nodes_of(claim))
+    claims = _claims_where(source, lambda claim: claim.held.needs(thing.name))
     held = _held(source, claims, running)
     what = "not in the inventory"
     if node:
