@@ -18,9 +18,10 @@ from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from playwright.sync_api import Browser, Route, expect
 
+from tests.e2e.rig.net import free_port
 from tests.kit import repo
 from tests.kit.browser import Visit, chromium
-from tests.kit.http import Answer, free_port, serving
+from tests.kit.http import Answer, serving
 from tests.kit.limits import PATIENCE_S
 from tests.kit.rig import book
 from tests.page.story import FAILING, Story, leased, released, story
