@@ -103,11 +103,7 @@ class Decision:
             domains = (domain for domain in config.domains.values() if domain.when_full == "wait")
             leases = (permission.lease_in(domain, put) for domain in domains)
             return min((lease.seconds for lease in leases if lease), default=None)
-        claims = (
-            self.state.ledger.claims_with("demand", self.request.demand)
-            if self.request.demand
-            else ()
-        )
+        claims = self.state.ledger.claims_with("demand", self.request.demand)
         claims = claims or tuple(change.after for change in self.changes.claims if change.after)
         return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
 
@@ -338,7 +334,7 @@ def _wait(
     # a demand that is sent again keeps its place among those that wait
     waiting = WaitingDemand(demand, before.since if before else now)
     reasons, who = tuple(each.message for each in faults), waiting.requesters
-    return Wait("wait", demand.id, (), demand.demand, who, waiting=waiting, reasons=reasons)
+    return Wait("wait", demand.id, (), demand.demand, who, waiting=waiting, notes=reasons)
 
 
 # ---- book and plan ----
@@ -464,8 +460,6 @@ def notes_on(
     yield from rendered.blocked
     if isinstance(request, Drain):
         yield from request.stays
-    if isinstance(request, Wait):
-        yield from request.reasons
     yield from forbidden.warnings(request, after)
 
 
@@ -500,7 +494,7 @@ def may_demand(
             why = config.why_no_node(word) if is_node else f"is not known{suggestion(word, known)}"
             raise Refused.at(field, f"{quoted(word)} {why}")
     answer = Answer(node, (fault("node", "no node is in an access domain"),), (), ())
-    for name in [node] if node else [*sorted(config.domain_of), *config.example_nodes()]:
+    for name in [node] if node else config.usable_nodes():
         held = Application(f"may/{requester}", appdef, name, version=version)
         demanded = (Item(held, (requester,)),)
         demand = Demand("put", "may", demanded, f"may/{requester}", (requester,))

@@ -382,7 +382,7 @@ _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    if not config.domain_of and not [*config.example_nodes()]:
+    if not config.usable_nodes():
         return {}
     plain = replace(config, overrides={})
     return {name: list(_trial_services(appdef, plain)) for name, appdef in config.appdefs.items()}
@@ -392,7 +392,7 @@ def _trial_services(
     appdef: ApplicationDefinition, config: Config, version: str = ""
 ) -> Iterator[ServiceRelease]:
     services = config.services.get(appdef.name, {}).values()
-    nodes = [*sorted(config.domain_of), *config.example_nodes()]
+    nodes = config.usable_nodes()
     # A service that runs once for a cluster has no node in other clusters. So this is the first
     # node that can run all services, else the first of all.
     fitting = (node for node in nodes if all(node in s.runs_at for s in services if s.nodes))

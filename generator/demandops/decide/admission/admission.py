@@ -186,7 +186,7 @@ def _definition_faults(  # noqa: PLR0912 - a branch for each fault
             f"version '{version}' instead, or choose an id that does not end in '@{version}'",
         )
     if app.version and app.version not in versions:
-        listed = config.entry_files.get(VERSIONS_FILE, {}).get(appdef.name)
+        listed = config.entry_files[VERSIONS_FILE].get(appdef.name)
         where = f"{appdef.name} in {listed or config.place_of(CHARTS_FILE)}"
         message = f"{quoted(app.version)} is not a version or channel of {where}"
         if not listed:
