@@ -270,7 +270,9 @@ DATA = st.recursive(
     LISTS | st.sampled_from([*WORDS, *STAND_INS, *LONG]) | st.none() | NUMBERS,
     lambda inner: (
         st.lists(inner, max_size=3)
-        | st.dictionaries(st.sampled_from(["a", "b", *WORDS, *STAND_INS, *LONG[:3]]), inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(["a", "b", *WORDS, *STAND_INS, *LONG[:3]]), inner, max_size=3
+        )
     ),
     max_leaves=6,
 )
