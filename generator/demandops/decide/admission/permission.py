@@ -74,11 +74,11 @@ def needed_access(
         yield domain, access
 
 
-def may_place(item: Item, appdef: str, node: str, config: Config) -> bool:
-    """Return whether the requesters may use a node for an ``appdef``, or without one as an end."""
-    domain = config.domain_of.get(node)
-    access: Access = [("applications", appdef)] if appdef else []
-    access.append(("nodes", config.host_of(node)))
+def may_place(item: Item, node: str, config: Config) -> bool:
+    """Return whether the requesters may use a node for an application, or as a connection's end."""
+    domain, access = config.domain_of.get(node), [("nodes", config.host_of(node))]
+    if isinstance(item.held, Application) and item.held.appdef:
+        access.insert(0, ("applications", item.held.appdef))
     return domain is not None and not any(_not_allowed(item, domain, access))
 
 

@@ -66,12 +66,11 @@ WaitingDemands: TypeAlias = "HashTrieMap[str, WaitingDemand]"
 
 @dataclass(frozen=True, slots=True)
 class Wait(Demand):
-    """What a demand that must wait becomes; ``reasons`` say why."""
+    """What a demand that must wait becomes; its ``notes`` say why."""
 
     operation: Operation = "wait"
     is_complete: bool = True
     waiting: WaitingDemand | None = None
-    reasons: tuple[str, ...] = ()
 
 
 def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:
