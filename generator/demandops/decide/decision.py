@@ -357,7 +357,7 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
 ) -> _Booked:
     if isinstance(request, Drain):
         request = relocation.with_moves(
-            request, state, state.usage(), state.names(), placement.MOST_ATTEMPTS
+            request, state, state.usage, state.names, placement.MOST_ATTEMPTS
         )
     if isinstance(request, Restoration):
         # claims of before the upgrade may carry a route twice
@@ -400,11 +400,11 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
     # a service whose node is to be chosen later has no release yet
     affected = affected_keys(state, after, changes.claims)
     keys = [key for key in affected if isinstance(key, ClientKey) or key.node]
-    names = collisions.followed(state.names(), state, after, keys)
+    names = collisions.followed(state.names, state, after, keys)
     clashes = [
         *collisions.topic_faults(request, state, after, _paced(keys, checkpoint), names),
         *collisions.name_faults(
-            request, state, after, _paced(keys, checkpoint), changes, state.names()
+            request, state, after, _paced(keys, checkpoint), changes, state.names
         ),
     ]
     claims = filter(None, (change.after for change in changes.claims))
@@ -418,11 +418,11 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
     if refused := [difference.fault for difference in differing if difference.is_refused]:
         raise Refused(refused)
     grown = forbidden.growth(planned.former, planned.plans, state.config)
-    refusal = forbidden.NoRoom(state.usage(), grown, state.config)
+    refusal = forbidden.NoRoom(state.usage, grown, state.config)
     # a drain was tried on its nodes already, and what releases claims makes room
     if refusal.full and (request.adds_claims or isinstance(request, Restoration)):
         raise refusal
-    after = state.followed_by(ledger, planned, state.usage().plus(grown), names)
+    after = state.followed_by(ledger, planned, state.usage.plus(grown), names)
     makes_room = any(amount < 0 for amount in grown.values())
     return _Booked(request, after, changes, planned, differing, makes_room)
 

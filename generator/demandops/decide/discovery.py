@@ -158,10 +158,8 @@ def _node(id: str, source: ClusterNode, how: Discovery, problems: list[str]) -> 
             problems.append(f"node '{id}': {told} of label {quoted(key)} is left out")
         return is_usable
 
-    words, names = (
-        _keys(how.capability_labels, _CAPABILITY, labels),
-        _keys(how.property_labels, _PROPERTY, labels),
-    )
+    words = _keys(how.capability_labels, _CAPABILITY, labels)
+    names = _keys(how.property_labels, _PROPERTY, labels)
     properties = {name: _read(labels[key]) for name, key in names.items()}
     role = labels.get(how.type_label)
     capacity = dict[str, str]()

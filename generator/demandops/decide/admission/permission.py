@@ -130,10 +130,8 @@ def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
 
 def owner_faults(request: Demand, ledger: Ledger, config: Config) -> Iterator[Fault]:
     """Yield a fault if the request changes a demand of others, which no rule lets it manage."""
-    waiting, claims = (
-        ledger.waiting.get(request.demand),
-        ledger.claims_with("demand", request.demand),
-    )
+    waiting = ledger.waiting.get(request.demand)
+    claims = ledger.claims_with("demand", request.demand)
     owners = waiting.requesters if waiting else requesters_of(claims)
     homes = None if waiting else [claim.held.home for claim in claims]
     yield from stranger_faults(request, owners, homes, config)

@@ -133,7 +133,7 @@ class _Places(Generic[_Result]):
         own = [*ledger.claims_with("demand", request.demand), *kept]
         nodes = {node for c in own if c.is_on_application for node in c.application.needed_nodes()}
         placed = Counter(app.node for app in request.applications if app.node)
-        return Room(self._state, self._state.usage(), nodes, placed=placed)
+        return Room(self._state, self._state.usage, nodes, placed=placed)
 
     def placed(self) -> tuple[Demand, list[Fault]]:
         """Return the request with the best node for each application and service, and the faults.

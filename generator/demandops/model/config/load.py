@@ -125,7 +125,8 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     node_patterns = EntryPatterns("node", reader.patterns[configs.NODES_FILE], problems)
     unlisted = UnlistedNodes(node_patterns, domains, completed)
     reader.why_not[configs.NODES_FILE] = unlisted.why_not
-    clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
+    clients = registry.ClientsFile(apiVersion=API_VERSION, kind="Clients")
+    client_files = dict[str, str]()
     for file in reader.files_of[configs.CLIENTS_FILE]:
         part = reader.read_file(file, registry.ClientsFile)
         words = part.model_fields_set - {"apiVersion", "kind"} if part else set()

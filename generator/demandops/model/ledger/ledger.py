@@ -213,9 +213,6 @@ class Ledger:
         for claims in self.claims.values():
             yield from claims
 
-    def __len__(self) -> int:
-        return sum(len(claims) for claims in self.claims.values())
-
 
 def ledger_of(claims: Iterable[Claim]) -> Ledger:
     ledger = Ledger()

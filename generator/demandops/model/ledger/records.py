@@ -46,10 +46,6 @@ class WaitingDemand:
     def requesters(self) -> tuple[str, ...]:
         return tuple(sorted(self.put.requesters()))
 
-    @property
-    def turn(self) -> tuple[int, datetime, str]:  # the lowest is tried first
-        return -self.put.priority, self.since, self.demand
-
     def __eq__(self, other: object) -> bool:
         # by the goal as it was sent
         if not isinstance(other, WaitingDemand):
@@ -73,8 +69,8 @@ class Wait(Demand):
     waiting: WaitingDemand | None = None
 
 
-def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:
-    return sorted(waiting.values(), key=lambda demand: demand.turn)
+def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:  # the first is tried first
+    return sorted(waiting.values(), key=lambda each: (-each.put.priority, each.since, each.demand))
 
 
 def waiting_path(demand: str) -> str:
