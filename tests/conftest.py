@@ -24,7 +24,7 @@ from hypothesis import HealthCheck, settings
 
 from tests.kit import repo
 from tests.kit.cli import Run, runner
-from tests.kit.limits import LONGEST_TEST_S
+from tests.kit.limits import LONGEST_TEST_S, PATIENCE_S
 from tests.kit.processes import Drivers
 from tests.kit.repo import GitRepo, Person
 from tests.kit.rig import running
@@ -87,6 +87,9 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         patch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path_factory.mktemp("home")))
         patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
         patch.delenv("DEMANDOPS_STATE_REPO", raising=False)
+        patch.setenv("no_proxy", "127.0.0.1,localhost")
+        # no slow machine leaves a thread behind
+        patch.setattr("demandops.serve.generator._GRACE_S", PATIENCE_S)
         patch.setenv(HELM_BIN, "/nowhere/helm")  # so `check` never finds Helm
         for name, value in repo.TEST_GIT_CONFIG.items():
             patch.setenv(name, value)

@@ -304,15 +304,13 @@ _PARAMETERS = {
 )
 @click.pass_context
 def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
-    """Keep a ROS node's parameters equal to those in a ConfigMap.
-
-    The ConfigMap holds a ROS parameter file. The command sets the parameters of the running node
+    """The ConfigMap holds a ROS parameter file. The command sets the parameters of the running node
     when the ConfigMap changes, and when the node starts again: all at once, or none if the node
     refuses one. Everything after --ros-args goes to ROS. The ROS parameters are those of the
     reference's k8s_configmap_watcher: configmap_name, namespace, ros_params_file_name (the key in
     the ConfigMap; default params.yml) and target_ros_node (several are separated by commas). A
-    probe reads in the file state_file that they are `set`, or why not. Stop the command with
-    Ctrl-C or SIGTERM.
+    probe reads in the file state_file that they are `set`, or why not. Stop the command with Ctrl-C
+    or SIGTERM.
 
     \b
     Examples:

@@ -82,17 +82,15 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
     leader_lease: str | None,
     signing_key: Path | None,
 ) -> None:
-    """Run the ROS 2 node that accepts demands.
-
-    Its actions are DeploymentRequest and Demand. With --clusters, it tells clusters of a push,
-    watches rollouts and takes over nodes. Everything after --ros-args goes to ROS.
-    Parameters: action_name (of DeploymentRequest), demand_action_name, answer (of
-    DeploymentRequest: pushed, reconciled or healthy), answer_timeout (seconds),
-    deployment_request_ids (use, or ignore for clients that number their goals; docs/demand.md),
-    state_repo, fetch_interval, requester_queue_limit (how many demands of one requester may be
-    without an answer), log_level (debug, info, warn, error or fatal). The parameter file of the
-    reference's node works too (docs/reference.md). Stop the node with Ctrl-C or SIGTERM: it
-    publishes queued demands for some seconds, and the journal keeps the others for the next start.
+    """Its actions are DeploymentRequest and Demand. With --clusters, it tells clusters of a push,
+    watches rollouts and takes over nodes. Everything after --ros-args goes to ROS. Parameters:
+    action_name (of DeploymentRequest), demand_action_name, answer (of DeploymentRequest: pushed,
+    reconciled or healthy), answer_timeout (seconds), deployment_request_ids (use, or ignore for
+    clients that number their goals; docs/demand.md), state_repo, fetch_interval,
+    requester_queue_limit (how many demands of one requester may be without an answer), log_level
+    (debug, info, warn, error or fatal). The parameter file of the reference's node works too
+    (docs/reference.md). Stop the node with Ctrl-C or SIGTERM: it publishes queued demands for some
+    seconds, and the journal keeps the others for the next start.
 
     \b
     Examples:

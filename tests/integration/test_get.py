@@ -98,20 +98,23 @@ def test_watch_prints_the_list_again_when_it_changes(on: On, fleet: GitRepo) -> 
 
 class TestStatus:
     @pytest.fixture
-    def access(self, tmp_path: Path) -> Callable[[str], tuple[str, Path]]:
-        """Return a function that gives access to a cluster at a URL: the option for it."""
+    def access(self, tmp_path: Path) -> Callable[[str], tuple[str | Path, ...]]:
+        """Return a function that gives access to a cluster at a URL: the options for it."""
 
-        def to(url: str) -> tuple[str, Path]:
+        def to(url: str) -> tuple[str | Path, ...]:
             clusters = {"c-its": {"kubeconfig": str(kubeconfig(tmp_path, url))}}
             head = {"apiVersion": "demandops/v1", "kind": "ClusterAccess"}
             (tmp_path / "clusters.yaml").write_text(json.dumps(head | {"clusters": clusters}))
-            return "--clusters", tmp_path / "clusters.yaml"
+            return "--request-timeout", "1h", "--clusters", tmp_path / "clusters.yaml"
 
         return to
 
     def test_wait_lists_what_is_not_healthy_when_the_time_is_over_and_outlasts_the_remote(
         self, on: On, access: Any, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        slept = list[float]()  # no other time passes
+        monkeypatch.setattr(REAL, "sleep", slept.append)
+        monkeypatch.setattr(REAL, "monotonic", lambda: sum(slept))
         wait = ("status", "--wait", "--timeout", "1s", *access(NOBODY))
         ran = on(*wait)
         assert ran.code == 1

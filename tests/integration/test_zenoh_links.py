@@ -8,15 +8,14 @@ that part.
 from __future__ import annotations
 
 import json
-import socket
 from collections.abc import Iterator
-from contextlib import ExitStack
 from typing import Any
 
 import pytest
 import yaml
 import zenoh
 
+from tests.e2e.rig.net import free_port
 from tests.golden.cases import rendered
 from tests.kit.rig import wait_until
 
@@ -33,9 +32,7 @@ def configurations() -> dict[str, str]:
         if path.startswith("clusters/") and name.startswith("zenoh-"):
             config, _ = yaml.safe_load_all(text)
             found[name.removeprefix("zenoh-")] = config["data"]["config.json5"]
-    with ExitStack() as stack:
-        free = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(3)]
-        edge, station, router = (f"127.0.0.1:{each.getsockname()[1]}" for each in free)
+    edge, station, router = (f"127.0.0.1:{free_port()}" for _ in range(3))
     here = {
         "edge.example:7448": edge,
         "10.0.0.2:7448": edge,

@@ -10,6 +10,8 @@ from urllib.parse import urlsplit
 
 from playwright.sync_api import Browser, Page, sync_playwright
 
+from tests.kit.limits import PATIENCE_S
+
 _ALONE = (
     "--no-sandbox",
     "--disable-gpu",
@@ -33,7 +35,9 @@ def chromium() -> Iterator[Browser]:
     program = shutil.which("chromium")
     assert program, "chromium is not installed; run setup/system page"
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=program, args=list(_ALONE))
+        browser = playwright.chromium.launch(
+            executable_path=program, args=list(_ALONE), timeout=PATIENCE_S * 1000
+        )
         try:
             yield browser
         finally:
@@ -47,6 +51,7 @@ class Visit:
         self.url = url
         viewport = {"width": width, "height": 900 if width > 500 else 844}
         self.context = browser.new_context(viewport=viewport, **options)  # type: ignore[arg-type]
+        self.context.set_default_timeout(PATIENCE_S * 1000)
         self.context.add_init_script(_NOTE_LONG_TASKS)
         self.hosts: set[str] = set()
         self.complaints: list[str] = []

@@ -101,7 +101,7 @@ def terminal(
 # ---- in a dialogue ----
 
 CTRL_C = "\x03"
-_SILENCE_S = 5.0
+_SILENCE_S = 30.0  # far longer than a busy machine takes to end a command
 
 
 class Dialogue:
@@ -136,7 +136,7 @@ class Dialogue:
     def end(self) -> int:
         """Read until the command ends; return its exit code.
 
-        If the command prints nothing for some seconds, repeat the last text that was typed, such as
+        If the command prints nothing for so long, repeat the last text that was typed, such as
         Ctrl-C: Python can miss a Ctrl-C just before it begins to read. Do not repeat the text if
         the command has printed something since, because a second Ctrl-C would kill a command that
         is ending.

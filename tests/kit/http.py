@@ -77,9 +77,9 @@ def serving(answer: Callable[[Call], Answer] | None = None, port: int = 0) -> It
         def _serve(self) -> None:
             length = int(self.headers.get("Content-Length") or 0)
             call = Call(self.command, self.path, self.headers, self.rfile.read(length))
-            with lock:
-                served.calls.append(call)
+            with lock:  # who sees the call may change what is answered to the next
                 given = served.answer(call)
+                served.calls.append(call)
             is_whole = isinstance(given.body, bytes)
             size = ("Content-Length", str(len(given.body))) if is_whole else _CHUNKED
             self.send_response(given.status)

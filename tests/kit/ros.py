@@ -14,7 +14,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -51,10 +51,11 @@ def reserved() -> Iterator[int]:
     random.shuffle(domains)
     for domain in domains:
         path = Path(tempfile.gettempdir()) / f"ros-domain-{domain}.lock"
-        with path.open("w") as lock:
-            try:
+        with ExitStack() as stack:
+            try:  # another user's file cannot be opened
+                lock = stack.enter_context(path.open("w"))
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            except (BlockingIOError, PermissionError):
                 continue
             if _is_free(domain):
                 yield domain
@@ -90,9 +91,9 @@ class Served:
         data: dict[str, Any] = json.loads(self.demandops("bookkeeping", "--output", "json"))
         return data
 
-    def wait_for(self, text: str, seconds: float = PATIENCE_S) -> None:
+    def wait_for(self, text: str) -> None:
         """Wait until the log contains ``text``; else fail with :meth:`last_words`."""
-        end = time.monotonic() + seconds
+        end = time.monotonic() + PATIENCE_S
         while text not in self.log.read_text():
             is_over = self.process.poll() is not None or time.monotonic() > end
             if is_over and text not in self.log.read_text():

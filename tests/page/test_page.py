@@ -18,6 +18,7 @@ from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from playwright.sync_api import Browser, Route, expect
 
+from tests.e2e.rig.net import free_port
 from tests.kit import repo
 from tests.kit.browser import Visit, chromium
 from tests.kit.http import Answer, serving
@@ -229,7 +230,7 @@ def test_the_page_follows_again_when_its_server_is_back(browser: Browser, fleet:
     def serve(address: str) -> WebServer:
         return WebServer(address, "--listen", Follower(Reader.of(str(fleet.bare)), {}, 0))
 
-    server = serve("127.0.0.1:0")
+    server = serve(f"127.0.0.1:{free_port()}")
     visit = Visit(browser, server.url.rstrip("/"))
     page, address = visit.open("/demands"), urlsplit(server.url).netloc
     expect(page.locator("#live")).to_have_text("live")

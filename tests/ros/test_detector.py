@@ -35,7 +35,7 @@ def rules_of(**fields: Any) -> str:
     demand["applications"][0]["id"] = "edge/near-{entity}"
     near = {"source": "vehicles", "point": {"x": 0.0, "y": 0.0}, "start": 84, "stop": 90}
     rule = {"name": "near", "near": near, "demand": demand, "retry": "1s"}
-    sources = {"vehicles": {"topic": "/vehicles/{entity}/pose", "type": POSE}}
+    sources = {"vehicles": {"topic": "/vehicles/{entity}/pose", "type": POSE, "timeout": "1h"}}
     return text_of(rule | fields, sources=sources)
 
 
@@ -67,12 +67,13 @@ def test_who_comes_near_demands_until_it_leaves_and_rules_are_reloaded(
         return {*served.bookkeeping().get("demands", {})}
 
     client.wait(lambda: served.log.read_text().count("unknown-node") > 4)  # it tries again
+    client.wait(lambda: detecting.log.read_text().count("unknown-node") > 1)  # also of the other
     assert detecting.log.read_text().count("unknown-node") == 2, "each refusal is logged once"
     names = ["demandops_detector_client", "watcher"]
     client.wait(lambda: {*names} <= {*client.node.get_node_names()})
     client.wait(warns_of("demands"))
     rules.write_text(rules_of(near={"source": "vehicle"}))
-    fault = "rules.yaml:9: rules[0].near.stop: is missing; add it; the last valid"
+    fault = "rules.yaml:10: rules[0].near.stop: is missing; add it; the last valid"
     client.wait(lambda: fault in detecting.log.read_text())
     client.wait(warns_of("rules"))
     rules.write_text(rules_of())

@@ -155,8 +155,7 @@ def test_the_example_of_the_scaffold_follows_all_at_once_or_not_at_all(
             want(["/b", "two words"], result_topic="/elsewhere")
             state = tmp_path / "state"
             client.wait(lambda: "refused its parameters: wave_topics: " in state.read_text())
-            assert "'two words'" in state.read_text()
-            assert state.read_text() in sync.log.read_text()
+            assert "'two words'" in sync.log.read_text()
             client.wait(lambda: is_passed_on("/a", "/b"))
             want([""])
             client.wait(lambda: state.read_text() == "set\n")

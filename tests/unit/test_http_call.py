@@ -19,16 +19,12 @@ from demandops.base.http_call import HttpAnswer, NoAnswer
 
 from tests.kit import plain_yaml
 from tests.kit.http import Answer, serving
+from tests.kit.limits import PATIENCE_S
 
 SECRET = "s3cret"  # noqa: S105 - no real secret
 
 
-@pytest.fixture(autouse=True)
-def _no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("no_proxy", "127.0.0.1,localhost")
-
-
-def call(url: str, timeout: float = 5.0) -> HttpAnswer:
+def call(url: str, timeout: float = PATIENCE_S) -> HttpAnswer:
     return http_call.call("POST", url, {"Authorization": SECRET}, b"{}", timeout)
 
 

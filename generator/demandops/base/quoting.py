@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+from collections.abc import Sequence
 from typing import Any
 
 # The longest line of text from outside, in characters; the rest is cut off
@@ -54,6 +55,15 @@ def harmless(text: str) -> str:
     # Forges look into commit messages, titles and texts of pull requests: `[skip ci]` stops a
     # pipeline, `Fixes #1` closes an issue, `@name` calls a person.
     return _TRIGGER.sub(lambda match: f"{match[0][:-1]}\\x{ord(match[0][-1]):02x}", text)
+
+
+def count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
+def some(names: Sequence[str], most: int) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
 
 
 def clipped(text: str, most: int) -> str:

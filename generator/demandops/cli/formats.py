@@ -72,12 +72,14 @@ def output_formats(*formats: str) -> Callable[[Command], Command]:
 output_option = output_formats("text", "json")
 
 
-def show(output: str, data: object, text: Iterable[str | Table]) -> None:
+def show(output: str, data: Any, text: Iterable[str | Table]) -> None:  # noqa: ANN401
     if output == "json":
         print_json(data)
         return
+    if output == "yaml" or output.startswith(_PATH):
+        data = json.loads(json.dumps(data))  # with lists for tuples
     if output == "yaml":
-        click.echo(strict_yaml.dump(json.loads(json.dumps(data))), nl=False)
+        click.echo(strict_yaml.dump(data), nl=False)
         return
     if output.startswith(_PATH):
         click.echo(lines(filled(output.removeprefix(_PATH), data)))

@@ -14,6 +14,7 @@ import sys
 from contextlib import suppress
 from enum import IntEnum
 from importlib import import_module
+from inspect import getdoc
 from pathlib import Path
 from types import ModuleType
 
@@ -25,7 +26,8 @@ from demandops.base.quoting import OneLineFormatter, one_line
 from demandops.cli.output import OutputLost, done, errors, open_streams, show_slow
 from demandops.repo.git import child_processes
 
-# The short help of each command, which `--help` shows without importing its module.
+# The short help of each command, which `--help` shows without importing its module, and with which
+# the command's own help begins.
 COMMANDS = {
     "approve": "Approve a proposal: merge its branch in your own name.",
     "bookkeeping": "Show who requests which service and connection.",
@@ -145,6 +147,7 @@ def load(name: str) -> click.Command:
     ros = module.startswith("demandops_ros.")
     found = imported(name, module if ros else f"demandops.cli.{module}")
     command: click.Command = getattr(found, name.replace("-", "_"))
+    command.help = f"{COMMANDS[name]}\n\n{getdoc(command.callback)}"
     return command
 
 

@@ -120,7 +120,7 @@ errors = _Errors()
 
 def warn_of_not_rendered(paths: Collection[str]) -> None:
     if paths:
-        files = "1 generated file" if len(paths) == 1 else f"{len(paths)} generated files"
+        files = quoting.count(len(paths), "generated file")
         listed = ", ".join(sorted(paths)[:_MOST_LISTED])
         more = ", …" if len(paths) > _MOST_LISTED else ""
         errors.print(f"warning: a generator has yet to write or remove {files}: {listed}{more}")

@@ -26,10 +26,8 @@ from demandops.views.rows import Column
 @click.command()
 @output_option
 def version(output: str) -> None:
-    """Print the versions of the program and of its formats.
-
-    The render version says how the program renders the files in `clusters/`. A generator refuses a
-    state repo of another render version. If the repo's version is older, run `demandops upgrade`;
+    """The render version says how the program renders the files in `clusters/`. A generator refuses
+    a state repo of another render version. If the repo's version is older, run `demandops upgrade`;
     if it is newer, update the generator.
 
     \b
@@ -64,12 +62,10 @@ VARIABLE = "_DEMANDOPS_COMPLETE"
 @click.command()
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]), metavar="bash|zsh|fish")
 def completion(shell: str) -> None:
-    """Print the completion script for a shell.
-
-    The script completes commands, options, and names in the state repo, such as those of demands,
-    nodes, releases, requesters, proposals and overrides. The names come from the state repo on
-    which the completed command would work. If this state repo is behind a URL, the script fetches
-    nothing, but reads the commit that was fetched last.
+    """The script completes commands, options, and names in the state repo, such as those of
+    demands, nodes, releases, requesters, proposals and overrides. The names come from the state
+    repo on which the completed command would work. If this state repo is behind a URL, the script
+    fetches nothing, but reads the commit that was fetched last.
 
     \b
     Examples:
@@ -92,9 +88,7 @@ _name = click.argument("name", metavar="NAME", shell_complete=context_names)
 
 @click.group()
 def config() -> None:
-    """List, set and choose contexts: the fleets that you work with.
-
-    A context names a state repo, the access to its clusters and a signing key, so that commands
+    """A context names a state repo, the access to its clusters and a signing key, so that commands
     need no options. The contexts are in ~/.config/demandops/contexts.yaml. $XDG_CONFIG_HOME
     replaces ~/.config.
 

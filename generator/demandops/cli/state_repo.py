@@ -71,10 +71,8 @@ def init(
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Create a state repo.
-
-    The first commit has the files that people edit, with the fleet that --example names.
-    To make a cluster follow the state repo, install Flux or Argo CD on the cluster (docs/flux.md,
+    """The first commit has the files that people edit, with the fleet that --example names. To make
+    a cluster follow the state repo, install Flux or Argo CD on the cluster (docs/flux.md,
     docs/argocd.md) and run:
 
         git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
@@ -173,9 +171,7 @@ def upgrade(
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Render everything again, in one commit.
-
-    Use this command when a new version of demandops renders differently, because a generator
+    """Use this command when a new version of demandops renders differently, because a generator
     refuses a state repo of another render version. Also use it to change between Flux and Argo CD.
     Such a change needs steps on the clusters, before and after: docs/argocd.md lists them. If no
     file changes, the command makes no commit.
@@ -268,13 +264,11 @@ def _upgrade_lines(result: Upgrade, steps: list[Json], dry_run: bool) -> Iterato
 )
 @output_option
 def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> None:
-    """Render commits again from their ledger and compare the bytes.
-
-    REV names one commit, A..B the commits after A up to B; default: the newest commit. REV, A and B
-    are commits or times. Once the state repo has policy/allowed-signers, each further commit of the
-    generator must have a good signature. The version of this file in the commit's parent must list
-    the signing key (docs/audit.md). People's commits are skipped: nothing proves who made them,
-    unless they are signed. The exit code is 1 if a commit fails, or if none is verified.
+    """REV names one commit, A..B the commits after A up to B; default: the newest commit. REV, A
+    and B are commits or times. Once the state repo has policy/allowed-signers, each further commit
+    of the generator must have a good signature. The version of this file in the commit's parent
+    must list the signing key (docs/audit.md). People's commits are skipped: nothing proves who made
+    them, unless they are signed. The exit code is 1 if a commit fails, or if none is verified.
 
     \b
     Examples:
@@ -349,9 +343,7 @@ _DROP_S = 15.0
 )
 @output_option
 def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> None:
-    """List the accepted demands that are not published.
-
-    A generator on this machine accepted these demands. If it still runs, it carries them out.
+    """A generator on this machine accepted these demands. If it still runs, it carries them out.
     Otherwise the next generator that starts here for the state repo does. If a journal is damaged,
     no generator starts, because the journal may lack demands. In this case, use --set-aside, and
     send again the listed demands that are still needed. --output json prints their goals. A demand

@@ -15,7 +15,7 @@ from pydantic import Field, StringConstraints, model_validator
 from demandops.base import settings, strict_yaml
 from demandops.base.errors import InvalidInput, StateRepoError, suggestion
 from demandops.base.naming import SubjectKind
-from demandops.base.quoting import quoted
+from demandops.base.quoting import count, quoted, some
 from demandops.base.strict_yaml import located_in
 from demandops.cli.output import errors
 from demandops.decide.planning.planner import all_keys, plan
@@ -176,13 +176,9 @@ def hint_to_pull() -> list[str]:
 def hint_to_push() -> list[str]:
     # what a person has just written in the checkout counts only once it is on main
     around = _checkout()
-    files = (
-        [path for path in changed_in(around) if path.split("/")[0] in CONFIG_ROOTS]
-        if around
-        else []
-    )
-    more = f" and {len(files) - 3} more" if len(files) > 3 else ""
-    told = f"note: only in this checkout, not on main: {', '.join(files[:3])}{more}"
+    changed = changed_in(around) if around else ()
+    files = [path for path in changed if path.split("/")[0] in CONFIG_ROOTS]
+    told = f"note: only in this checkout, not on main: {some(files, 3)}"
     return [f"{told}; commit and push to demand with them"] if files else []
 
 
@@ -231,8 +227,7 @@ def _state_repo(*, writes: bool = True, required: bool = True) -> Callable[[Comm
         if value is None and required:
             raise click.UsageError(NO_STATE_REPO, ctx)
         if value and not writes and (behind := commits_behind(Path(value))):
-            lacks = "1 commit" if behind == 1 else f"{behind} commits"
-            errors.print(f"note: this checkout is {lacks} behind main: git pull")
+            errors.print(f"note: this checkout is {count(behind, 'commit')} behind main: git pull")
         return value or ""
 
     option = click.option(

@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 from rpds import HashTrieMap
 
 from demandops.base.errors import Fault, InvalidInput, OverLimit, Refused, fault
-from demandops.base.quoting import one_line
+from demandops.base.quoting import one_line, some
 from demandops.base.strict_yaml import load_all, short_repr
 from demandops.decide.booking import apply
 from demandops.decide.checks import collisions, forbidden
@@ -148,9 +148,7 @@ def effects_of(releases: Collection[ReleaseChange]) -> Iterator[str]:
     for effect in get_args(Effect):
         names = [each.name for each in releases if effect and each.effect == effect]
         if names:
-            more = len(names) - _MOST_NAMES
-            shown = ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
-            yield f"{effect} {shown}"
+            yield f"{effect} {some(names, _MOST_NAMES)}"
 
 
 @dataclass(frozen=True, slots=True)

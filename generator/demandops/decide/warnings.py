@@ -15,7 +15,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path, suggestion
 from demandops.base.placeholders import example_of, is_pattern, shape_of
 from demandops.base.quantities import amount_of, amount_text
-from demandops.base.quoting import quoted
+from demandops.base.quoting import quoted, some
 from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, first_uncovered, needed_access
 from demandops.decide.booking import Drain
@@ -510,10 +510,7 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
     # Kubernetes applies a NetworkPolicy only to pods with their own network.
     for name, group in groupby(nodes, key=lambda pair: pair[0]):
         if config.domains[name].network == "namespace":
-            ids = [*dict.fromkeys(id for _, id, *_ in group)]
-            listed = ", ".join(f"'{id}'" for id in ids[:_MOST_NODES])
-            if len(ids) > _MOST_NODES:
-                listed += f" and {len(ids) - _MOST_NODES} more"
+            listed = some([*dict.fromkeys(f"'{id}'" for _, id, *_ in group)], _MOST_NODES)
             message = (
                 f"'network: namespace' of access domain '{name}' has no effect on nodes whose pods "
                 f"use the host's network: {listed}; set hostNetwork: false for these nodes, "

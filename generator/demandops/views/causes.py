@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Literal
 
+from demandops.base.quoting import count, some
 from demandops.decide.planning.overrides import suspended_claims
 from demandops.model.config.config import IMAGES_FILE
 from demandops.model.config.override import Override
@@ -310,14 +311,13 @@ def _awaited(source: Source) -> Iterator[Cause]:
             cluster=orphan.cluster,
         )
     if files := sorted(source.not_rendered):
-        more = f" and {len(files) - _MOST_LISTED} more" if len(files) > _MOST_LISTED else ""
         yield Cause(
             "waiting",
-            "1 generated file" if len(files) == 1 else f"{len(files)} generated files",
+            count(len(files), "generated file"),
             f"{'waits' if len(files) == 1 else 'wait'} for a generator to carry out a person's "
             "commit",
             "the operator of the generator",
             "start a generator; a running generator carries out the commit at its next fetch",
             since=source.entry.time,
-            told=", ".join(files[:_MOST_LISTED]) + more,
+            told=some(files, _MOST_LISTED),
         )

@@ -6,7 +6,7 @@ import json
 import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from itertools import islice
 from typing import Any
@@ -16,12 +16,7 @@ from demandops.base.naming import SubjectKind
 from demandops.base.placeholders import is_pattern, texts
 from demandops.cluster.health import Health
 from demandops.cluster.rollouts import ReleaseStatus
-from demandops.decide.bookkeeping import (
-    carried_topics,
-    connection_entry,
-    service_entry,
-    versions_asked,
-)
+from demandops.decide import bookkeeping
 from demandops.decide.planning.overrides import suspended_by
 from demandops.decide.planning.planner import running_version
 from demandops.model.config.base_model import duration_text, parse_file, parse_time, relative
@@ -194,6 +189,12 @@ def _named(kind: str) -> Column:
     return Column("name", kind.capitalize(), links=kind)
 
 
+def _text(
+    key: str, title: str, rank: int, texts_of: Callable[[Json], Any], links: str = ""
+) -> Column:
+    return Column(key, title, rank, texts_of=lambda item, now: texts_of(item), links=links)
+
+
 def _wide(key: str, title: str, links: str = "", texts_of: TextsOf | None = None) -> Column:
     return Column(key, title, 9, texts_of=texts_of, links=links, only_wide=True)
 
@@ -205,16 +206,16 @@ def _command(title: str, words_of: Callable[[Json], list[str]]) -> Column:
     return Column("name", title, 9, "command", text, only_wide=True)
 
 
+def _pairs(key: str, sign: str = ": ", text: Callable[[Any], str] = str) -> TextsOf:
+    return lambda item, now: [f"{name}{sign}{text(value)}" for name, value in item[key].items()]
+
+
 def _decide(proposal: Json, verb: str) -> list[str]:
     return ["demandops", verb, proposal["name"], "--commit", proposal["commit"]]
 
 
-HOLDS = Column(
-    "applications",
-    "Holds",
-    3,
-    texts_of=lambda item, now: [*item["applications"], *item["connections"]],
-    links="held",
+HOLDS = _text(
+    "applications", "Holds", 3, lambda item: [*item["applications"], *item["connections"]], "held"
 )
 
 
@@ -238,8 +239,12 @@ def nodes_of(claim: Claim) -> tuple[str, ...]:
     return tuple(sorted({*held.nodes, *filter(None, (claim.connection.broker,))}))
 
 
-def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> list[str]:
-    return sorted({claim.subject.id for claim in claims if claim.subject.kind is kind})
+def _subjects(claims: Iterable[Claim]) -> Json:
+    subjects = {claim.subject for claim in claims}
+    return {
+        kind.value: sorted(subject.id for subject in subjects if subject.kind is kind)
+        for kind in (SubjectKind.APPLICATION, SubjectKind.CONNECTION)
+    }
 
 
 # ---- what is held: demands, applications, claims, leases and requesters ----
@@ -256,14 +261,14 @@ def state_of(source: Source, claims: Sequence[Claim]) -> str:
 
 
 def _held(source: Source, claims: Sequence[Claim], state: str) -> Json:
-    """Return what items have in common that consist of claims."""
+    # what items have in common that consist of claims
     nodes = sorted({node for claim in claims for node in nodes_of(claim)})
     return {
         "state": state,
         "requesters": list(requesters_of(claims)),
         "nodes": nodes,
         "domains": domains_of(source, nodes),
-        "since": time_data(min(claim.booked for claim in claims)),
+        "since": time_data(min((claim.booked for claim in claims), default=None)),
         "lease": lease_data(_first_lease(claims)),
         "ended": None,
     }
@@ -284,21 +289,21 @@ def _demands(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 
 def _demand(source: Source, holds: list[Claim] | WaitingDemand, state: str, runs: Json) -> Json:
-    if isinstance(holds, WaitingDemand):
-        item: Json = {"name": holds.demand, "state": state, "requests": [holds.put.id]}
-        item |= {"requesters": list(holds.requesters), "applications": [], "connections": []}
-        item |= {"nodes": [], "domains": [], "since": time_data(holds.since), "lease": None}
-        return item | {"suspended_by": [], "ended": None, **runs}
-    suspending = filter(None, (suspended_by(claim, source.state) for claim in holds))
-    return {
-        "name": holds[0].demand,
-        **_held(source, holds, state),
-        "requests": sorted({claim.request for claim in holds}),
-        "applications": ids_of(holds, SubjectKind.APPLICATION),
-        "connections": ids_of(holds, SubjectKind.CONNECTION),
+    waiting = holds if isinstance(holds, WaitingDemand) else None
+    claims = [] if isinstance(holds, WaitingDemand) else holds
+    suspending = filter(None, (suspended_by(claim, source.state) for claim in claims))
+    item = {
+        "name": waiting.demand if waiting else claims[0].demand,
+        **_held(source, claims, state),
+        "requests": sorted({claim.request for claim in claims}),
+        **_subjects(claims),
         "suspended_by": sorted({override.path for override in suspending}),
         **runs,
     }
+    if waiting:
+        item |= {"requests": [waiting.put.id], "requesters": list(waiting.requesters)}
+        item["since"] = time_data(waiting.since)
+    return item
 
 
 def _leases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -359,21 +364,8 @@ def claim_item(source: Source, claim: Claim, state: str) -> Json:
     }
 
 
-def _suspending(item: Json, now: datetime) -> list[str]:
-    override = item["suspended_by"]
-    return [override["name"]] if override else []
-
-
 def _subject(item: Json, now: datetime) -> list[str]:
     return [subject_text(item), *(f"held for {id}" for id in item["held_for"])]
-
-
-def _ends(item: Json, now: datetime) -> str:
-    return _lease_text(item, now).removeprefix("ends ")
-
-
-def _term(item: Json, now: datetime) -> str:
-    return duration_text(item["lease"]["seconds"])
 
 
 def _requesters(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -387,27 +379,20 @@ def _requesters(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
             waiting[requester].append(demand.demand)
     for requester in sorted({*claims_of, *waiting}):
         claims = claims_of[requester]
-        releases = sorted(
-            {
-                name
-                for demand in {claim.demand for claim in claims}
-                for name in source.releases_of_demands.get(demand, ())
-            }
-        )
-        state = state_of(source, claims) if claims else "waiting"
-        yield requester, (requester, claims, state, waiting[requester], _runs(source, releases))
+        demands, of_demand = {claim.demand for claim in claims}, source.releases_of_demands
+        releases = {name for demand in demands for name in of_demand.get(demand, ())}
+        state, runs = state_of(source, claims) if claims else "waiting", sorted(releases)
+        yield requester, (requester, claims, state, waiting[requester], _runs(source, runs))
 
 
 def _requester(
     source: Source, name: str, claims: list[Claim], state: str, waiting: list[str], runs: Json
 ) -> Json:
-    held: Json = {"state": state, "nodes": [], "domains": [], "since": None, "lease": None}
     return {
         "name": name,
-        **(_held(source, claims, state) if claims else held | {"ended": None}),
+        **_held(source, claims, state),
         "demands": sorted({*waiting, *(claim.demand for claim in claims)}),
-        "applications": ids_of(claims, SubjectKind.APPLICATION),
-        "connections": ids_of(claims, SubjectKind.CONNECTION),
+        **_subjects(claims),
         **runs,
         "requesters": [name],
     }
@@ -434,10 +419,6 @@ def _release_was(reader: Reader, entry: LogEntry, path: str) -> Json:
     return place | {"requesters": entry.trailers.get("Requester", [])}
 
 
-def _services(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    yield from (each for each in _releases(source) if isinstance(each[1][0], ServiceRelease))
-
-
 def _release(
     source: Source, release: Release, claims: list[Claim], status: ReleaseStatus | None
 ) -> Json:
@@ -446,8 +427,8 @@ def _release(
         own = {
             "version": release.chart.version,
             "application_version": release.version.name or None,
-            "versions_asked": versions_asked(release, source.active.ledger),
-            **service_entry(source.active, release),
+            "versions_asked": bookkeeping.versions_asked(release, source.active.ledger),
+            **bookkeeping.service_entry(source.active, release),
         }
     else:
         own = {"version": None, "application_version": None, "versions_asked": {}}
@@ -484,7 +465,7 @@ def _connections(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 
 def _connection(source: Source, claims: tuple[Claim, ...], runs: Json) -> Json:
-    entry = connection_entry(claims)
+    entry = bookkeeping.connection_entry(claims)
     nodes = [entry["source"], entry["target"]]
     return {
         "name": claims[0].subject.id,
@@ -504,16 +485,8 @@ def _asked_topics(topics: dict[str, list[str]], item: Json) -> list[str]:
     ]
 
 
-def _topics(item: Json, now: datetime) -> list[str]:
-    return _asked_topics(carried_topics(item), item)
-
-
 def _inputs(item: Json, now: datetime) -> list[str]:
     return [text for topics in item["inputs"].values() for text in _asked_topics(topics, item)]
-
-
-def _parameters(item: Json, now: datetime) -> list[str]:
-    return [f"{name} = {value}" for name, value in item["parameters"].items()]
 
 
 def _versions(item: Json, now: datetime) -> list[str]:
@@ -522,10 +495,6 @@ def _versions(item: Json, now: datetime) -> list[str]:
         item["application_version"] or item["version"] or "",
         *(f"{version} requested by {', '.join(requesters)}" for version, requesters in asked),
     ]
-
-
-def _reason(item: Json, now: datetime) -> str:
-    return f"{item['object']}: {item['reason']}" if item["object"] else item["reason"] or ""
 
 
 # ---- where it runs, and by which rules: nodes, domains and application definitions ----
@@ -571,20 +540,11 @@ def _node(source: Source, id: str, claims: list[Claim], runs: Json) -> Json:
         "properties": dict(node.properties) if node else {},
         "position": node.position.model_dump() if node and node.position else None,
         "releases": runs["releases"],
-        "applications": ids_of(claims, SubjectKind.APPLICATION),
-        "connections": ids_of(claims, SubjectKind.CONNECTION),
+        **_subjects(claims),
         "demands": sorted({claim.demand for claim in claims}),
         "requesters": list(requesters_of(claims)),
         "health": runs["health"],
     }
-
-
-def _properties(item: Json, now: datetime) -> list[str]:
-    return [f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()]
-
-
-def _quotas(item: Json, now: datetime) -> list[str]:
-    return [f"{name}: {most}" for name, most in item["quotas"].items()]
 
 
 def _domains(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
@@ -651,14 +611,9 @@ def _override_was(reader: Reader, entry: LogEntry, path: str) -> Json:
 
 
 def effect_texts(override: Json, *_: object) -> list[str]:
-    shown = ("version", "replicas", "node")
-    listed = ("images", "values")
     return [
-        f"{name} {value}"
-        if name in shown
-        else f"{name} {', '.join(value)}"
-        if name in listed
-        else name
+        # of images and values their names, and `hold: true` without its value
+        name if value is True else f"{name} {', '.join(value) if type(value) is dict else value}"
         for name, value in override["effects"].items()
     ]
 
@@ -670,8 +625,7 @@ def _affected(item: Json, now: datetime) -> list[str]:
 
 def _proposals(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     for proposal in source.proposals:
-        data = asdict(proposal) | {"since": time_data(proposal.since)}
-        link = source.proposal_links.get(proposal.branch)
+        data, link = vocabulary.proposal_data(proposal), source.proposal_links.get(proposal.branch)
         yield proposal.branch, ({"name": proposal.branch, **data, "link": link},)
 
 
@@ -699,9 +653,24 @@ def _told(commit: Json, now: datetime) -> str:
 _NODE = Column("node", "Node", 3, links="node")
 _VERSION = Column("version", "Version", 7, texts_of=_versions)
 _CLUSTER = Column("cluster", "Cluster", 8)
-_COMMIT = Column("commit", "Commit", texts_of=lambda item, now: item["commit"][:10])
-_FOR = Column(
-    "applications", "For", 5, texts_of=lambda item, now: item["applications"] or item["connections"]
+_COMMIT = _text("commit", "Commit", 0, lambda item: item["commit"][:10])
+_FOR = _text("applications", "For", 5, lambda item: item["applications"] or item["connections"])
+_ENDS = replace(
+    LEASE, title="Ends", rank=1, texts_of=lambda *lease: _lease_text(*lease).removeprefix("ends ")
+)
+_TERM = _text("term", "Term", 3, lambda item: duration_text(item["lease"]["seconds"]))
+_REASON = _text(
+    "reason", "Reason", 1, lambda item: ": ".join(filter(None, (item["object"], item["reason"])))
+)
+_TOPICS = _text(
+    "topics", "Topics", 5, lambda item: _asked_topics(bookkeeping.carried_topics(item), item)
+)
+_SUSPENDED_BY = _text(
+    "suspended_by",
+    "Suspended by",
+    4,
+    lambda item: (item["suspended_by"] or {}).get("name", ""),
+    "override",
 )
 
 KINDS: dict[str, Kind] = {
@@ -737,10 +706,9 @@ KINDS: dict[str, Kind] = {
             "releases",
             "Helm releases and the clients of connections, each shared by all who need it.",
             (
-                *(_named("release"), HEALTH, ENDED),
-                Column("reason", "Reason", 1, texts_of=_reason),
+                *(_named("release"), HEALTH, ENDED, _REASON),
                 *(_NODE, replace(REQUESTERS, rank=4), _FOR, SINCE, _VERSION, _CLUSTER),
-                Column("seen", "Seen", 9, texts_of=lambda item, now: (item["seen"] or "")[:10]),
+                _text("seen", "Seen", 9, lambda item: (item["seen"] or "")[:10]),
             ),
             _releases,
             _release,
@@ -753,16 +721,11 @@ KINDS: dict[str, Kind] = {
             "Releases of services, one for each service on a node, shared by all who need it.",
             (
                 *(_named("release"), HEALTH, Column("service", "Service", 6), _NODE, REQUESTERS),
-                Column(
-                    "source",
-                    "For",
-                    5,
-                    texts_of=lambda item, now: item["source"] or item["applications"],
-                ),
+                _text("source", "For", 5, lambda item: item["source"] or item["applications"]),
                 *(_VERSION, _CLUSTER, _wide("inputs", "Takes in", texts_of=_inputs)),
-                _wide("parameters", "Parameters", texts_of=_parameters),
+                _wide("parameters", "Parameters", texts_of=_pairs("parameters", " = ")),
             ),
-            _services,
+            lambda source: (e for e in _releases(source) if isinstance(e[1][0], ServiceRelease)),
             _release,
             lambda item: {"release": [item["name"]]},
         ),
@@ -773,13 +736,12 @@ KINDS: dict[str, Kind] = {
                 *(_named("connection"), HEALTH, ENDED, Column("type", "Type", 4)),
                 Column("source", "From", 2, links="node"),
                 *(Column("target", "To", 2, links="node"), REQUESTERS),
-                Column("topics", "Topics", 5, texts_of=_topics),
-                _wide("releases", "Releases", "release"),
+                *(_TOPICS, _wide("releases", "Releases", "release")),
             ),
             _connections,
             _connection,
             lambda item: {
-                "topic": carried_topics(item),
+                "topic": bookkeeping.carried_topics(item),
                 "from": [item["source"]],
                 "to": [item["target"]],
             },
@@ -789,10 +751,7 @@ KINDS: dict[str, Kind] = {
         Kind(
             "leases",
             "Demands that end unless their requester renews them. The first to end comes first.",
-            (
-                *(_named("demand"), Column("lease", "Ends", 1, texts_of=_ends), REQUESTERS),
-                *(Column("term", "Term", 3, texts_of=_term), HOLDS),
-            ),
+            (_named("demand"), _ENDS, REQUESTERS, _TERM, HOLDS),
             _leases,
             _demand,
             lambda item: {"demand": [item["name"]]},
@@ -803,11 +762,10 @@ KINDS: dict[str, Kind] = {
             (
                 *(_named("node"), STATE, HEALTH, Column("type", "Type", 3)),
                 *(Column("domain", "Domain", 4), Column("cluster", "Cluster", 6)),
-                Column(
-                    "releases", "Releases", 5, texts_of=lambda item, now: str(len(item["releases"]))
-                ),
+                _text("releases", "Releases", 5, lambda item: str(len(item["releases"]))),
                 *(REQUESTERS, _wide("capabilities", "Capabilities")),
-                *(_wide("properties", "Properties", texts_of=_properties), _wide("file", "File")),
+                _wide("properties", "Properties", texts_of=_pairs("properties", text=json.dumps)),
+                _wide("file", "File"),
                 Column("gone_since", "Gone since", 9, "time", only_wide=True),
             ),
             _nodes,
@@ -832,8 +790,8 @@ KINDS: dict[str, Kind] = {
                 *(Column("name", "Domain"), Column("approval", "Approval", 2)),
                 *(Column("when_full", "When full", 5), Column("namespace", "Namespace", 4)),
                 *(Column("clusters", "Clusters", 3), Column("nodes", "Nodes", 1, links="node")),
-                *(Column("rules", "Rules", 6), _wide("quotas", "Quotas", texts_of=_quotas)),
-                _wide("file", "File"),
+                Column("rules", "Rules", 6),
+                *(_wide("quotas", "Quotas", texts_of=_pairs("quotas")), _wide("file", "File")),
             ),
             _domains,
         ),
@@ -852,8 +810,7 @@ KINDS: dict[str, Kind] = {
             "What one demand holds of one subject.",
             (
                 *(Column("subject", "Subject", texts_of=_subject, links="held"), STATE, REQUESTERS),
-                *(Column("demand", "Demand", 3, links="demand"), LEASE, SINCE),
-                Column("suspended_by", "Suspended by", 4, texts_of=_suspending, links="override"),
+                *(Column("demand", "Demand", 3, links="demand"), LEASE, SINCE, _SUSPENDED_BY),
                 *(_wide("request", "Request"), _wide("file", "File")),
             ),
             _claims,

@@ -9,6 +9,7 @@ from typing import Any, Generic, TypeVar
 
 from demandops.base.errors import DemandOpsError
 from demandops.base.runtime import REAL
+from demandops.cluster import rollouts
 from demandops.cluster.health import (
     ClusterDomain,
     Health,
@@ -17,29 +18,11 @@ from demandops.cluster.health import (
     Target,
     health_reader,
 )
-from demandops.cluster.rollouts import (
-    ChangedPaths,
-    OldBootstrap,
-    Orphan,
-    ReleaseStatus,
-    domains_of_state,
-    old_bootstraps,
-    orphans,
-    statuses,
-    target_of,
-)
 from demandops.cluster.watches import ObjectCache
 from demandops.decide.override_report import Entry, override_report, override_state
+from demandops.decide.planning import planner
 from demandops.decide.planning.overrides import without_suspended
-from demandops.decide.planning.planner import (
-    ReleaseKey,
-    affected_keys,
-    all_keys,
-    denied_release,
-    keys_of_claims,
-    plan,
-    takes,
-)
+from demandops.decide.planning.planner import ReleaseKey
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.inventory import Node
@@ -57,7 +40,7 @@ from demandops.views.rows import RANKS
 # ---- the health of a release in one word ----
 
 
-def word_of(status: ReleaseStatus) -> str:
+def word_of(status: rollouts.ReleaseStatus) -> str:
     if status.state == "unknown":
         return "unknown"
     if status.health.failing:
@@ -65,7 +48,7 @@ def word_of(status: ReleaseStatus) -> str:
     return {"healthy": "healthy", "reconciled": "starting", "waiting": "waiting"}[status.state]
 
 
-def since_of(status: ReleaseStatus) -> datetime | None:
+def since_of(status: rollouts.ReleaseStatus) -> datetime | None:
     # a cluster may report no valid time
     try:  # Python 3.10 reads no "Z"
         since = datetime.fromisoformat(status.since.replace("Z", "+00:00"))
@@ -74,13 +57,13 @@ def since_of(status: ReleaseStatus) -> datetime | None:
     return since if since.tzinfo else None
 
 
-def worst_word(statuses: Iterable[ReleaseStatus]) -> str:
+def worst_word(statuses: Iterable[rollouts.ReleaseStatus]) -> str:
     return min(map(word_of, statuses), key=RANKS.__getitem__, default="unknown")
 
 
 # ---- the state at one commit, and with it what the clusters report ----
 
-_UNKNOWN = ReleaseStatus(Health("waiting"))
+_UNKNOWN = rollouts.ReleaseStatus(Health("waiting"))
 _Value = TypeVar("_Value")
 
 
@@ -103,7 +86,7 @@ def by_booking(claims: Iterable[Claim]) -> list[Claim]:
 def needs(claim: Claim, release: Release) -> bool:
     if not isinstance(release, ServiceRelease):
         return True
-    return takes(claim.application, release.service, release.key)
+    return planner.takes(claim.application, release.service, release.key)
 
 
 class _Derived(Generic[_Value]):
@@ -134,15 +117,15 @@ class Source:
     problems: tuple[Problem, ...] = ()
     remedy: str = ""  # how to mend a configuration that is not in effect
     is_newest: bool = True
-    statuses: Mapping[str, ReleaseStatus] = field(default_factory=dict)
+    statuses: Mapping[str, rollouts.ReleaseStatus] = field(default_factory=dict)
     watched: frozenset[str] = frozenset()  # clusters
     proposals: tuple[PendingProposal, ...] = ()
     proposal_links: Mapping[str, str | None] = field(default_factory=dict)  # at a forge
     unread: str = ""  # why a newer state cannot be read or shown
     push_denied: str = ""  # why the node that shows the page cannot publish demands
     unreadable: Mapping[str, str] = field(default_factory=dict)  # why, by the cluster's name
-    old_bootstraps: tuple[OldBootstrap, ...] = ()
-    orphans: tuple[Orphan, ...] = ()
+    old_bootstraps: tuple[rollouts.OldBootstrap, ...] = ()
+    orphans: tuple[rollouts.Orphan, ...] = ()
     # What follows from the commit alone. Sources of one commit share it.
     derived: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
@@ -176,16 +159,16 @@ class Source:
         differing = subject_before.keys() ^ subject_now.keys()
         subjects = [*dict.fromkeys(subject_before.get(id) or subject_now[id] for id in differing)]
         changes = changes_on(old.ledger, new.ledger, subjects)
-        keys: set[ReleaseKey] = {*affected_keys(old, new, changes)}
+        keys: set[ReleaseKey] = {*planner.affected_keys(old, new, changes)}
         # what is planned as before may be needed by other claims
         needing: dict[ReleaseKey, list[Claim]] = {}
         for change in changes:
             was, now = before.active.ledger.get(change.key), self.active.ledger.get(change.key)
             if was:
-                for key in keys_of_claims(before.active, [was]):
+                for key in planner.keys_of_claims(before.active, [was]):
                     needing.setdefault(key, [])
             if now:
-                for key in keys_of_claims(self.active, [now]):
+                for key in planner.keys_of_claims(self.active, [now]):
                     needing.setdefault(key, []).append(now)
                     # the views show requesters, but `affected_keys` omits a release whose file
                     # stays the same although its requesters changed
@@ -198,7 +181,7 @@ class Source:
                 planned[key] = replace(earlier, claims=by_booking([*kept, *claims]))
         for key in keys:
             planned.pop(key, None)
-            if (anew := self._plan(key)) or denied_release(new, key):
+            if (anew := self._plan(key)) or planner.denied_release(new, key):
                 planned[key] = anew
         self.derived["planned"] = planned
         self.rows.update((name, (None, rows)) for name, (_, rows) in before.rows.items())
@@ -227,16 +210,16 @@ class Source:
         return {}
 
     def _plan(self, key: ReleaseKey) -> Planned | None:
-        if (release := plan(self.state, key)) is None:
+        if (release := planner.plan(self.state, key)) is None:
             return None
-        target = target_of(release, self.config.repo_settings)
+        target = rollouts.target_of(release, self.config.repo_settings)
         return Planned(release, target, claims_behind(self.active.ledger, release))
 
     @_Derived
     def planned(self) -> dict[ReleaseKey, Planned | None]:
         # None if the release is denied, if all claims that need it are suspended, or if the client
         # of a connection carries no topic
-        return {key: self._plan(key) for key in all_keys(self.state)}
+        return {key: self._plan(key) for key in planner.all_keys(self.state)}
 
     @_Derived
     def running(self) -> list[Planned]:
@@ -246,7 +229,7 @@ class Source:
     @_Derived
     def denied(self) -> list[tuple[Release, Override]]:
         keys = (key for key, planned in self.planned.items() if planned is None)
-        return [denied for key in keys if (denied := denied_release(self.state, key))]
+        return [denied for key in keys if (denied := planner.denied_release(self.state, key))]
 
     @_Derived
     def releases(self) -> dict[str, Release]:
@@ -304,11 +287,11 @@ class Source:
         return self._last_changes[path]
 
     def with_reports(
-        self, caches: Mapping[str, ObjectCache], history: History, changed: ChangedPaths
+        self, caches: Mapping[str, ObjectCache], history: History, changed: rollouts.ChangedPaths
     ) -> Source:
         """Add what clusters report, as read into their caches."""
         targets, domains = [planned.target for planned in self.running], self.domains
-        reported = statuses(targets, self.commit, caches, history, changed)
+        reported = rollouts.statuses(targets, self.commit, caches, history, changed)
         unread = {
             name: cache.why_unknown(self.watched_objects.get(name, ()))
             for name, cache in caches.items()
@@ -319,14 +302,14 @@ class Source:
             watched=frozenset(caches),
             unreadable={name: reason for name, reason in sorted(unread.items()) if reason},
             old_bootstraps=tuple(
-                old_bootstraps(domains, caches, self.reader().file_reader(self.commit))
+                rollouts.old_bootstraps(domains, caches, self.reader().file_reader(self.commit))
             ),
-            orphans=tuple(orphans(domains, targets, self.commit, caches, history)),
+            orphans=tuple(rollouts.orphans(domains, targets, self.commit, caches, history)),
         )
 
     @_Derived
     def domains(self) -> list[ClusterDomain]:
-        return domains_of_state(self.state)
+        return rollouts.domains_of_state(self.state)
 
     @_Derived
     def watched_objects(self) -> dict[str, list[ObjectSelector]]:
@@ -339,7 +322,7 @@ class Source:
             wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
         return {cluster: [*selectors] for cluster, selectors in wanted.items()}
 
-    def status(self, release: str) -> ReleaseStatus:
+    def status(self, release: str) -> rollouts.ReleaseStatus:
         return self.statuses.get(release, _UNKNOWN)
 
     @property

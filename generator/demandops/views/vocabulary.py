@@ -17,6 +17,7 @@ from demandops.model.ledger.claim import Claim
 from demandops.model.release import Release
 from demandops.render.gitops import path_of
 from demandops.repo.history.commit_log import LogEntry
+from demandops.repo.write.proposal_branch import PendingProposal
 
 Json = dict[str, Any]
 
@@ -90,6 +91,10 @@ def override_data(override: Override, effects: Iterable[str] | None = None) -> J
         "until": time_data(override.end),
         "reason": override.reason,
     }
+
+
+def proposal_data(proposal: PendingProposal) -> Json:
+    return asdict(proposal) | {"since": time_data(proposal.since)}
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 from demandops.base.errors import (
     DemandOpsError,
@@ -39,17 +39,10 @@ from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.repo.load import ledger_files
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
-from demandops.views import kinds
+from demandops.views import kinds, vocabulary
 from demandops.views.kinds import effect_texts, nodes_of
 from demandops.views.source import Source, by_booking
-from demandops.views.vocabulary import (
-    Json,
-    commit_data,
-    override_data,
-    place_data,
-    subject_data,
-    time_data,
-)
+from demandops.views.vocabulary import Json
 
 # ---- which thing a name means ----
 
@@ -230,10 +223,7 @@ def explain(source: Source, thing: Thing, most: int = 10) -> Json:
         "name": thing.name,
         "also": list(thing.also),
         "file": thing.path or None,
-        "proposals": [
-            asdict(proposal) | {"since": time_data(proposal.since)}
-            for proposal in _proposals(source, thing)
-        ],
+        "proposals": [vocabulary.proposal_data(proposal) for proposal in _proposals(source, thing)],
         **_EXPLAINED[thing.kind](source, thing),
         **_past(source, reader, thing, most),
     }
@@ -276,18 +266,18 @@ def _release(source: Source, thing: Thing) -> Json:
     if release := source.releases.get(thing.name):
         return {
             **kinds.release_of(source, release),
-            **_held(source, source.claims_of_releases[thing.name]),
+            **_held(source, source.claims_of_releases[thing.name], ()),
             "state": "runs",
             "shaped_by": [
                 {"file": file, "entry": entry or None, "what": what}
                 for file, entry, what in shaping_files(release, source.config)
             ],
-            "overrides": [override_data(*each) for each in release.shaping.by],
+            "overrides": [vocabulary.override_data(*each) for each in release.shaping.by],
         }
     for release, override in source.denied:
         if release.name == thing.name:
-            denied = override_data(override, ("deny",))
-            return {"state": "denied", **place_data(release), "denied_by": denied}
+            denied = vocabulary.override_data(override, ("deny",))
+            return {"state": "denied", **vocabulary.place_data(release), "denied_by": denied}
     return {"state": "gone"}
 
 
@@ -318,9 +308,9 @@ def _subject(source: Source, thing: Thing) -> Json:
         connection = claims[0].connection
         word = connection.type.word.upper() if connection.type else ""
         what = f"{word} {what} from {connection.source} to {connection.target}".lstrip()
-    held = _held(source, claims, _releases_for(source, claims))
+    held = _held(source, claims)
     state = "runs" if held["state"] == "held" else held["state"]
-    return {**held, "state": state, "what": what, "subject": subject_data(subject)}
+    return {**held, "state": state, "what": what, "subject": vocabulary.subject_data(subject)}
 
 
 def _demand(source: Source, thing: Thing) -> Json:
@@ -328,7 +318,7 @@ def _demand(source: Source, thing: Thing) -> Json:
     answer = _held_where(source, f"demand '{name}'", lambda claim: claim.demand == name)
     if waiting := source.state.ledger.waiting.get(name):
         answer |= {"state": "waiting", "requesters": list(waiting.requesters)}
-        answer |= {"file": waiting_path(name), "since": time_data(waiting.since)}
+        answer |= {"file": waiting_path(name), "since": vocabulary.time_data(waiting.since)}
     return answer
 
 
@@ -346,8 +336,8 @@ def _claim(source: Source, thing: Thing) -> Json:
     claim = ledger_files.claim_in(thing.path, source.state.ledger)
     if claim is None:
         return {"state": "gone"}
-    held = _held(source, [claim], _releases_for(source, [claim]))
-    return held | {"what": str(claim.subject), "subject": subject_data(claim.subject)}
+    of_claim = {"what": str(claim.subject), "subject": vocabulary.subject_data(claim.subject)}
+    return _held(source, [claim]) | of_claim
 
 
 def _node(source: Source, thing: Thing) -> Json:
@@ -372,7 +362,7 @@ def _override(source: Source, thing: Thing) -> Json:
     entry = next((e for e in source.overrides if e.override.name == thing.name), None)
     if entry is None:
         return {"state": "gone"}
-    data = override_data(entry.override)
+    data = vocabulary.override_data(entry.override)
     held = _held(source, [*entry.claims], affected_releases(entry, source.state))
     what = f"{', '.join(effect_texts(data))}, of {data['owner']}: {data['reason']}"
     return {**held, "state": entry.state, "what": what}
@@ -380,9 +370,7 @@ def _override(source: Source, thing: Thing) -> Json:
 
 def _proposal(source: Source, thing: Thing) -> Json:
     proposal = next(_proposals(source, thing), None)
-    if proposal is None:
-        return {"state": "gone"}
-    return {"state": "proposed", "what": proposal.summary}
+    return {"state": "proposed", "what": proposal.summary} if proposal else {"state": "gone"}
 
 
 def _appdef(source: Source, thing: Thing) -> Json:
@@ -428,24 +416,25 @@ def _held_where(source: Source, what: str, is_held: Callable[[Claim], bool]) -> 
     claims = sorted(
         filter(is_held, source.state.ledger), key=lambda claim: (str(claim.subject), claim.demand)
     )
-    return {**_held(source, claims, _releases_for(source, claims)), "what": what}
+    return {**_held(source, claims), "what": what}
 
 
-def _releases_for(source: Source, claims: Iterable[Claim]) -> Iterator[Release]:
-    keys = {claim.key for claim in claims}
-    for name, behind in source.claims_of_releases.items():
-        if any(claim.key in keys for claim in behind):
-            yield source.releases[name]
-
-
-def _held(source: Source, claims: list[Claim], releases: Iterable[Release] = ()) -> Json:
-    by_name = {release.name: release for release in releases}
-    states = [kinds.state_of(source, [claim]) for claim in claims]
+def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | None = None) -> Json:
+    """Return the claims and releases of a thing; by default the releases that the claims need."""
+    if releases is None:
+        keys, behind = {claim.key for claim in claims}, source.claims_of_releases.items()
+        names = (name for name, needed in behind if any(claim.key in keys for claim in needed))
+        releases = map(source.releases.__getitem__, names)
     return {
         "state": kinds.state_of(source, claims) if claims else "gone",
         "requesters": list(requesters_of(claims)),
-        "claims": [kinds.claim_item(source, *each) for each in zip(claims, states, strict=True)],
-        "releases": [kinds.release_of(source, by_name[name]) for name in sorted(by_name)],
+        "claims": [
+            kinds.claim_item(source, claim, kinds.state_of(source, [claim])) for claim in claims
+        ],
+        "releases": [
+            kinds.release_of(source, release)
+            for release in sorted(releases, key=lambda release: release.name)
+        ],
     }
 
 
@@ -482,7 +471,9 @@ def _past(source: Source, reader: Reader, thing: Thing, most: int) -> Json:
         if entry is None:
             return None
         behind = reader.person_commits_behind(entry, most=5)
-        return commit_data(entry) | {"carries_out": [commit_data(commit) for commit in behind]}
+        return vocabulary.commit_data(entry) | {
+            "carries_out": [vocabulary.commit_data(commit) for commit in behind]
+        }
 
     return {
         "started": row(history.started),

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from demandops.base.quoting import some
 from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
 from demandops.views.kinds import rows_of
@@ -346,8 +347,7 @@ class Drawing:
             if len(between) > _MOST_LINES and not (is_lit or is_late):
                 self.is_cut = True
                 continue
-            names = ", ".join(link["name"] for link in carried[:3])
-            names += f" and {len(carried) - 3} more" if len(carried) > 3 else ""
+            names = some([link["name"] for link in carried], 3)
             topics = sum(len(link["topics"]) for link in carried)
             title = f"{upper.label} and {lower.label}: {names}; {topics} topics; {worst}"
             singles = [card for card in (upper, lower) if not card.is_stack]

@@ -16,18 +16,11 @@ from starlette.requests import Request
 from demandops.model.config.base_model import parse_time
 from demandops.model.release import ServiceRelease
 from demandops.views import causes as cause_list
+from demandops.views import why
 from demandops.views.kinds import KINDS, Kind, past_rows, rows_of
 from demandops.views.rows import RANKS, TONES, Filter, Row, exactly, page_of, sorted_rows
 from demandops.views.source import Source
 from demandops.views.vocabulary import Json
-from demandops.views.why import (
-    commits_of,
-    explain,
-    find,
-    last_difference,
-    release_of,
-    stopped_with,
-)
 from demandops.web import fleet_map, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.time_line import Event
@@ -274,17 +267,17 @@ def _thing(asked: ViewRequest) -> tuple[str, Data]:
 
 def thing(source: Source, name: str, kind: str, health: Iterable[Event]) -> Data:
     # what it is, why, what it holds, its time line, and what to do
-    answer = explain(source, find(source, name, kind or None), _COMMITS)
+    answer = why.explain(source, why.find(source, name, kind or None), _COMMITS)
     kind, name, word = answer["kind"], answer["name"], answer["state"]
     runs = kind == "release" and word == "runs"
     if runs:
         word = answer["health"] or "unknown"
     # the commits and the changes of health that touch it, newest first
-    events = [time_line.of_commit(commit, word=did) for did, commit in commits_of(answer)]
+    events = [time_line.of_commit(commit, word=did) for did, commit in why.commits_of(answer)]
     names = {name, *(release["name"] for release in answer.get("releases", ()))}
     events += [change for change in health if change.release in names]
     claims, releases = answer.get("claims", ()), answer.get("releases", ())
-    difference, effect = last_difference(source, answer)
+    difference, effect = why.last_difference(source, answer)
     data: Data = {
         "it": answer,
         "word": word,
@@ -300,14 +293,14 @@ def thing(source: Source, name: str, kind: str, health: Iterable[Event]) -> Data
         "stop": "",
     }
     if kind == "demand" and answer["claims"]:
-        data["released"], data["refused"] = release_of(source, name)
+        data["released"], data["refused"] = why.release_of(source, name)
     if runs:
         release = source.releases[name]
         if isinstance(release, ServiceRelease):
             selection = ["--service", release.key.service, "--node", release.node.id]
         else:
             selection = [word for id in release.connections for word in ("--connection", id)]
-        data["stopped_with"] = stopped_with(source, name)
+        data["stopped_with"] = why.stopped_with(source, name)
         data["stop"] = shlex.join(["demandops", "suspend", *selection, "-m", "REASON"])
     return data
 

@@ -33,9 +33,7 @@ from demandops.detect import rule_file
 def detect(
     ctx: click.Context, rules: str | None, bag: Path | None, plot: Path | None, output: str
 ) -> None:
-    """Watch topics, and send the demands that rules ask for.
-
-    RULES is a file of rules (docs/detector.md); the ROS parameter "rules" can name it too. The
+    """RULES is a file of rules (docs/detector.md); the ROS parameter "rules" can name it too. The
     detector reads the file again when the file changes. Everything after --ros-args goes to ROS.
     Stop the detector with Ctrl-C or SIGTERM. Its demands then stay booked, and the next start
     continues with them.

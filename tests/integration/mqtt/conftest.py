@@ -19,6 +19,7 @@ import yaml
 from rclpy.node import Node
 
 from tests.e2e.rig import pki
+from tests.e2e.rig.net import free_port
 from tests.kit.limits import PATIENCE_S
 from tests.kit.rig import wait_until
 
@@ -60,8 +61,7 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
         [_program("mosquitto_passwd"), "-c", "-b", str(passwords), USER, PASSWORD],
         check=True,
     )
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = int(probe.getsockname()[1])
+    port = free_port()
     configuration = folder / "mosquitto.conf"
     configuration.write_text(
         f"listener {port} 127.0.0.1\nallow_anonymous false\npassword_file {passwords}\n"

@@ -72,7 +72,6 @@ def hub() -> Iterator[Hub]:
 @pytest.fixture
 def petra(hub: Hub, petra: Person, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Person:
     monkeypatch.setattr(proposal, "POLL_S", 0.05)
-    monkeypatch.setenv("no_proxy", "127.0.0.1")
     (tmp_path / "token").write_text(TOKEN)
     monkeypatch.setenv("DEMANDOPS_FORGE_TOKEN_FILE", str(tmp_path / "token"))
     root = petra.read("demandops.yaml")

@@ -102,7 +102,10 @@ class Cluster:
 
 
 @pytest.fixture
-def cluster(bare: Path, person: Person, clock: Clock) -> Iterator[Cluster]:
+def cluster(
+    bare: Path, person: Person, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Cluster]:
+    monkeypatch.setattr(node_discovery, "_PAUSE_S", 600.0)  # longer than a slow test takes
     person.change({CLUSTERS: FROM_CLUSTER})
     cluster = Cluster(bare, clock)
     with rig.running(bare, runtime=clock) as generator:

@@ -134,6 +134,7 @@ def test_a_running_generator_answers_a_demand_that_is_dropped(
             rig.wait_until(lambda: "trying again" in caplog.text, "the push fails")
             queued = generator.submit(goal(2), "op-2")
             rig.wait_until_queued([queued])
+            monkeypatch.setattr(state_repo, "_DROP_S", rig.PATIENCE_S)
             assert demandops(*command, "op-2").json() == {
                 "operation_id": "op-2",
                 "outcome": "answered",

@@ -8,6 +8,7 @@ import shutil
 import threading
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -248,8 +249,9 @@ def test_a_fetch_that_hangs_delays_no_demand(http: str, server: Server, bare: Pa
     with rig.running(http, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
         hang = server.faults.hang = threading.Event()
-        rig.wait_until(lambda: generator._repository._process, "a fetch is under way and hangs")  # type: ignore[attr-defined]
-        talking = generator._repository._process  # type: ignore[attr-defined]
+        repository: Any = generator._repository
+        rig.wait_until(lambda: server.faults.hanging and repository._process, "a fetch hangs")
+        talking = repository._process
         stages = Stages()
         ticket = generator.submit(goal(2), listener=stages)
         rig.wait_until(

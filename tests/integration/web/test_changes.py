@@ -230,7 +230,7 @@ def test_what_is_gone_has_a_list_of_its_own(shown: Shown) -> None:
     assert "mine" not in shown.look("/demands").text
     page = shown.look("/demands", gone="1")
     (row,) = page.texts("tr")[1:]
-    assert re.match(r"mine gone [0-9]+s ago by .*, release in [0-9a-f]{10} vehicle02", row)
+    assert re.match(r"mine gone [0-9ms]+ ago by .*, release in [0-9a-f]{10} vehicle02", row)
     assert "gone=1" in shown.look("/connections").link("Those that are gone")
     for name in LISTS:
         shown.look(f"/{name}", gone="1")

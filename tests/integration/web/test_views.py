@@ -248,19 +248,19 @@ def test_a_demand_that_waits_for_room_is_listed(still: Shown) -> None:
     assert thing(now, "later", "demand", ())["word"] == "waiting"
 
 
-def test_a_span_of_the_time_line_lists_only_its_events(still: Shown) -> None:
+def test_a_span_of_the_time_line_lists_only_its_events(shown: Shown) -> None:
     def commits(page: Page) -> list[str]:
         return [text.split()[-1] for text in page.texts("tr")[1:]]
 
-    everything = still.look("/timeline", span="all")
+    everything = shown.look("/timeline", span="all")
     assert len(commits(everything)) == 3 and "Create the state repo" in everything.text  # long ago
-    page = still.look("/timeline", span="15min")
+    page = shown.look("/timeline", span="15min")
     assert commits(page) == commits(everything)[:2]
     assert "2 events in the last 15min" in page.text
     dots = [title for title in page.texts("title") if " UTC, " in title]
     more = [int(count) for title in dots for count in re.findall(r"and (\d+) more", title)]
     assert len(dots) + sum(more) == 2  # the drawing has the same events as the list
-    assert len(commits(still.look("/timeline", span="7d", q="who:vehicle01"))) == 1
+    assert len(commits(shown.look("/timeline", span="7d", q="who:vehicle01"))) == 1
 
 
 def test_the_time_line_fills_the_drawing(still: Shown) -> None:

@@ -17,12 +17,14 @@ from typing import Any
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops.base.runtime import Runtime
+from demandops.cluster import leadership
 from demandops.cluster.leadership import Leadership
 from kubernetes import client, config
 
 from tests.kit.chance import IN_FULL
 from tests.kit.clock import Turns
 from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.limits import PATIENCE_S
 
 PATH = "/apis/coordination.k8s.io/v1/namespaces/its/leases/generator"
 TAKES_OVER_S = 15 + 2
@@ -112,7 +114,8 @@ def seed() -> int:
 
 
 @pytest.fixture
-def server(tmp_path: Path, seed: int) -> Iterator[Server]:
+def server(tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    monkeypatch.setattr(leadership, "_CALL_S", PATIENCE_S)  # only the moved clock ends a call
     made = Server(Turns(seed), {"metadata": {"name": "generator", "resourceVersion": "1"}})
     with serving(made.answer) as running:
         reached = config.new_client_from_config(str(kubeconfig(tmp_path, running.url)))

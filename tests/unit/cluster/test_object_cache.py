@@ -335,12 +335,13 @@ def test_nodes_come_change_and_go(kube: KubeApi, told: Told) -> None:
 
 def test_what_no_decision_sees_is_not_told(kube: KubeApi, told: Told) -> None:
     put(kube, "bus0")
-    wait_until(told.by_name, "the list")
+    wait_until(lambda: told.by_name() and told.times, "the list")
     before = told.times
     for ready in ("False", "Unknown", "True"):
         put(kube, "bus0", ready=ready)
     put(kube, "bus1")  # a watch tells all in order
     wait_until(lambda: "bus1" in told.by_name(), "the second node")
+    wait_until(lambda: told.times > before, "it is told, after it is known")
     assert told.times == before + 1
 
 

@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit import plain_yaml
+from tests.kit.chance import examples
 from tests.kit.config import override_of
 from tests.kit.memory import MemoryRepo
 
@@ -32,6 +33,7 @@ _text = partial(dumps, sort_keys=True)
 patch = st.fixed_dictionaries({}, optional={"k": json, "l": json})
 
 
+@examples(100)
 @given(json, patch)
 def test_a_merge_patch_is_that_of_rfc_7386(target: Any, patch: Any) -> None:
     result = overridden(target, patch, {})

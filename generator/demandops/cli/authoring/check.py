@@ -9,7 +9,7 @@ from pathlib import Path
 
 import click
 
-from demandops.base.quoting import lines, one_line
+from demandops.base.quoting import count, lines, one_line
 from demandops.cli.formats import output_formats, print_json
 from demandops.cli.output import busy, errors, say
 from demandops.cli.queries.commits import entry_lines, release_lines
@@ -96,9 +96,8 @@ def fence(text: str, language: str) -> str:
 
 
 def _findings(checked: CheckResult) -> Iterator[str]:
-    count = len(checked.faults)
-    if count:
-        yield f"## DemandOps: {'1 error' if count == 1 else f'{count} errors'}\n"
+    if checked.faults:
+        yield f"## DemandOps: {count(len(checked.faults), 'error')}\n"
     else:
         yield "## DemandOps: valid, and every release renders\n"
     yield from (f"\n{line}\n" for line in chart_lines(checked.charts, code))
@@ -132,10 +131,7 @@ _MOST_DIFF_LINES_JSON = 20_000
 
 @click.command()
 @click.argument(
-    "directory",
-    type=click.Path(path_type=Path, exists=True),
-    metavar="[DIR|RULES]",
-    default=Path(),
+    "directory", type=click.Path(path_type=Path, exists=True), metavar="[DIR|RULES]", default=Path()
 )
 @click.option(
     "--base",
@@ -150,9 +146,7 @@ _MOST_DIFF_LINES_JSON = 20_000
 )
 @output_formats("text", "json", "markdown")
 def check(directory: Path, base: str | None, require_helm: bool, output: str) -> None:
-    """Check edits of a state repo and show their consequences.
-
-    DIR is a checked-out state repo; default: this folder. The files of DIR must be valid, every
+    """DIR is a checked-out state repo; default: this folder. The files of DIR must be valid, every
     application must render, no generated file may be edited, and a changed chart needs a new
     version. If a generated file is edited, the command prints the override to write instead. Helm
     lints the charts, and renders them for the current releases and for an example of each
@@ -176,15 +170,12 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
     elif output == "markdown":
         click.echo(report(checked), nl=False)
     else:
-        for fault in checked.faults:
-            errors.print(f"error: {fault}")
-        for warning in checked.warnings:
-            errors.print(f"warning: {warning}")
-        if not checked.faults:
-            say(f"{directory}: all files are valid and every release renders")
-            for line in chart_lines(checked.charts):
-                say(line)
-        for line in _lines(checked):
+        for word, faults in (("error", checked.faults), ("warning", checked.warnings)):
+            for fault in faults:
+                errors.print(f"{word}: {fault}")
+        valid = f"{directory}: all files are valid and every release renders"
+        valid_lines = [] if checked.faults else [valid, *chart_lines(checked.charts)]
+        for line in (*valid_lines, *_lines(checked)):
             say(line)
     if checked.faults:
         raise click.exceptions.Exit(1)
@@ -193,12 +184,8 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
 def _data(checked: CheckResult) -> Json:
     merge, entries, charts = checked.preview, checked.bookkeeping, None
     if checked.charts is not None:
-        charts = {
-            "rendered": list(checked.charts.rendered),
-            "releases": checked.charts.releases,
-            "examples": checked.charts.examples,
-            "not_rendered": dict(checked.charts.not_rendered),
-        }
+        names = ("rendered", "releases", "examples", "not_rendered")
+        charts = {name: getattr(checked.charts, name) for name in names}
     files = merge.files if merge else ()
     diffs, left_out = _bounded(files, _MOST_DIFF_LINES_JSON)
     changes = [
@@ -221,8 +208,7 @@ def _data(checked: CheckResult) -> Json:
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
     # the diffs that fit into `most` lines, by path, and the number of other lines
-    shown: dict[str, str] = {}
-    left_out = 0
+    shown, left_out = dict[str, str](), 0
     for file in files:
         lines = list(file.diff())
         if len(lines) <= most:
@@ -291,10 +277,10 @@ def _sections(checked: CheckResult, most_lines: int) -> Iterator[_Section]:
         + (f" (new, {new[file.path]} lines)" if file.path in new else "")
         for file in files
     ]
-    count = "1 file" if len(files) == 1 else f"{len(files)} files"
     note = "without this edit too, as a generator has yet to carry out earlier commits"
     note = f"{len(checked.pending)} of them {note}" if checked.pending else ""
-    yield _Section(f"the generator will write or remove {count}", listed, note=note)
+    title = f"the generator will write or remove {count(len(files), 'file')}"
+    yield _Section(title, listed, note=note)
     written = tuple(file for file in files if file.after is not None and file.path not in new)
     diffs, left_out = _bounded(written, most_lines)
     yield from (_Section(path, text.splitlines(), "diff") for path, text in diffs.items())

@@ -44,11 +44,9 @@ _directory = click.option(
 
 @click.group()
 def new() -> None:
-    """Write a new application or image.
-
-    The files in the state repo are valid as they are: `demandops check` passes. `new image` writes
-    to the repository of a ROS package instead. The command changes no existing file and commits
-    nothing.
+    """The files in the state repo are valid as they are: `demandops check` passes. `new image`
+    writes to the repository of a ROS package instead. The command changes no existing file and
+    commits nothing.
 
     \b
     Examples:

@@ -94,10 +94,8 @@ SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     help="Write all schemas to this folder, as <name>.json.",
 )
 def schema(name: str | None, folder: Path | None) -> None:
-    """Print the JSON Schema of a kind of file.
-
-    Without NAME, list the schemas. With a schema, an editor checks and completes files. For VS Code
-    and its YAML extension, begin a file with `# yaml-language-server: $schema=…/nodes.json`.
+    """Without NAME, list the schemas. With a schema, an editor checks and completes files. For VS
+    Code and its YAML extension, begin a file with `# yaml-language-server: $schema=…/nodes.json`.
 
     \b
     Examples:

@@ -98,8 +98,7 @@ until_option = click.option(
 
 @click.group()
 def override() -> None:
-    """Create and end overrides: deviations that people declare.
-
+    """
     \b
     Examples:
       demandops override create calm --node edge --hold -m "Demonstration"
@@ -185,7 +184,7 @@ def create(name: str, values: str | None, options: Options, **given: Any) -> Non
         patch = strict_yaml.load(content, file)
         if not isinstance(patch, dict):
             raise InvalidInput.at("", "must be a mapping of Helm values", file=file)
-    selected = {f"{name}s": given.pop(f"{name}s") for name in SELECTED}
+    selected = selector({f"{name}s": given.pop(f"{name}s") for name in SELECTED})
     given["images"] = dict(given["images"]) or None
     # a flag that is not given is no effect
     more = {field: value for field, value in given.items() if value is not False}
@@ -211,19 +210,20 @@ def end(name: str, options: Options) -> None:
 def _create(
     name: str,
     summary: str,
-    selected: Mapping[str, tuple[str, ...]],
+    selected: Mapping[str, list[str]],
     fields: Mapping[str, Any],
     options: Options,
 ) -> None:
+    path = _path_of(name)
     with writable(options) as repo:
         options = options.with_reason()
-        if not (chosen := selector(selected)):
+        if not selected:
             raise click.UsageError("select what the override applies to, for example --node edge")
-        if repo.file_reader()(_path_of(name)) is not None:
+        if repo.file_reader()(path) is not None:
             message = "exists already; end it first, or choose another name"
-            raise InvalidInput.at("", message, file=_path_of(name))
+            raise InvalidInput.at("", message, file=path)
         unknown = []
-        for kind, patterns in chosen.items():
+        for kind, patterns in selected.items():
             # only a freeze can be about what nobody demands yet
             is_open = kind in ("applications", "connections", "requesters")
             names = [*all_names(repo, kind)]
@@ -244,31 +244,23 @@ def _create(
         given = {"reason": options.reason, "owner": owner} | {
             field: value for field, value in fields.items() if value is not None
         }
-        text = override_text(name, {**given, "select": [chosen]})
-        parsed = Override.from_file(name, parse_file(OverrideFile, text, _path_of(name)))
+        text = document(path, "override", "Override", {**given, "select": [selected]})
+        parsed = Override.from_file(name, parse_file(OverrideFile, text, path))
         note = "  refuses what is new; what runs may be renewed, reduced and released"
 
         def more(before: State, after: State) -> tuple[Json, list[str]]:
             stays = relocation.following_overrides(after).stays
-            lines = [f"  {text}" for path, text in stays if path == parsed.path]
+            lines = [f"  {text}" for of, text in stays if of == path]
             return {"override": override_data(parsed)}, [note] * bool(parsed.refuseNew) + lines
 
-        files, branch = {parsed.path: text}, f"override/{name}"
-        person_change.commit(repo, files, summary, branch, options, more)
+        person_change.commit(repo, {path: text}, summary, f"override/{name}", options, more)
 
 
 def _path_of(name: str) -> str:
     return f"{OVERRIDES_ROOT}/{name}.yaml"
 
 
-def override_text(name: str, fields: dict[str, Any]) -> str:
-    given = {key: value for key, value in fields.items() if value is not None}
-    return document(_path_of(name), "override", "Override", given)
-
-
-def _end(
-    name: str, summary: str, selected: Mapping[str, tuple[str, ...]], options: Options
-) -> None:
+def _end(name: str, summary: str, selected: Mapping[str, list[str]], options: Options) -> None:
     with writable(options) as repo:
         overrides = repo.snapshot().state.config.overrides
         override = overrides.get(name)
@@ -280,21 +272,20 @@ def _end(
             raise InvalidInput.at("", f"there is no override '{name}'{hint}")
         # a person may have changed what the file selects since it was suspended
         selects = [select.model_dump(exclude_none=True).items() for select in override.select]
-        wanted = [{kind: {*values} for kind, values in selector(selected).items()}]
+        wanted = [{kind: {*values} for kind, values in selected.items()}]
         if selected and [{kind: {*own} for kind, own in select} for select in selects] != wanted:
             message = f"selects something else; to end it, run: demandops resume {name}"
             raise InvalidInput.at("select", message, file=_path_of(name))
-        files, more = {override.path: None}, {"override": override_data(override)}
-        branch = f"override/{name}"
-        person_change.commit(repo, files, summary, branch, options, lambda *_: (more, ()))
+        files, more = {override.path: None}, ({"override": override_data(override)}, ())
+        person_change.commit(repo, files, summary, f"override/{name}", options, lambda *_: more)
 
 
 # ---- ``demandops suspend``: an override that denies applications and connections ----
 
 
-def name_of(selected: Mapping[str, tuple[str, ...]]) -> str:
+def name_of(selected: Mapping[str, list[str]]) -> str:
     # equal selections get the same name, so that `resume` finds the override
-    chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
+    chosen = sorted((kind, sorted(values)) for kind, values in selected.items())
     words = "-".join(value for _, values in chosen for value in values)
     return "suspend-" + naming.slug_with_hash(words, repr(chosen), 6)
 
@@ -303,10 +294,8 @@ def name_of(selected: Mapping[str, tuple[str, ...]]) -> str:
 @selecting
 @until_option
 @editing
-def suspend(expires: str | None, options: Options, **selected: tuple[str, ...]) -> None:
-    """Stop applications and connections; their claims stay booked.
-
-    Nothing runs for these claims, and new demands that match the options are refused. To end the
+def suspend(expires: str | None, options: Options, **given: tuple[str, ...]) -> None:
+    """Nothing runs for these claims, and new demands that match the options are refused. To end the
     suspension, give `demandops resume` the same selection, such as --requester vehicle00. The
     command creates an override with `deny` in your own name.
 
@@ -320,15 +309,13 @@ def suspend(expires: str | None, options: Options, **selected: tuple[str, ...]) 
         with reader.opened(options.state_repo, only_read=True) as repo:
             hint = target.options_for(repo, names[0], SELECTED)
         raise click.UsageError(f"say by an option what {quoted(names[0])} is{hint}")
-    effect = {"expires": expires, "deny": True}
+    selected, effect = selector(given), {"expires": expires, "deny": True}
     _create(name_of(selected), f"Suspend {described(selected)}", selected, effect, options)
 
 
-def described(selected: Mapping[str, tuple[str, ...]]) -> str:
+def described(selected: Mapping[str, list[str]]) -> str:
     return ", ".join(
-        f"{kind.removesuffix('s')} {value}"
-        for kind, values in selector(selected).items()
-        for value in values
+        f"{kind.removesuffix('s')} {value}" for kind, values in selected.items() for value in values
     )
 
 
@@ -339,23 +326,21 @@ def described(selected: Mapping[str, tuple[str, ...]]) -> str:
 @click.argument("name", required=False, metavar="[NAME]", shell_complete=names_of("overrides"))
 @selecting
 @editing
-def resume(name: str | None, options: Options, **selected: tuple[str, ...]) -> None:
-    """Run suspended applications and connections again.
-
-    Give the same selection as for `demandops suspend`, such as --requester vehicle00, or NAME, the
-    override's name. The command ends this override.
+def resume(name: str | None, options: Options, **given: tuple[str, ...]) -> None:
+    """Give the same selection as for `demandops suspend`, such as --requester vehicle00, or NAME,
+    the override's name. The command ends this override.
 
     \b
     Examples:
       demandops resume --requester vehicle00
       demandops resume suspend-vehicle00-1c2f3a
     """
-    if bool(name) == bool(selector(selected)):
+    selected = selector(given)
+    if bool(name) == bool(selected):
         raise click.UsageError(
             "give either the options of `demandops suspend`, or the override's name"
         )
-    summary = f"Resume {name or described(selected)}"
-    _end(name or name_of(selected), summary, {} if name else selected, options)
+    _end(name or name_of(selected), f"Resume {name or described(selected)}", selected, options)
 
 
 # ---- ``demandops drain`` and ``undrain``: the field `drained` of a node in the inventory ----
@@ -367,9 +352,8 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
         if node not in config.nodes:
             message = f"{quoted(node)} {config.why_no_node(node)}"
             if pattern := config.node_patterns.get(node.partition("@")[0]):
-                place = pattern.where
-                flag = "true" if drained else "false"
-                message = f"is a pattern of many nodes; write drained: {flag} yourself, in {place}"
+                flag = f"write drained: {str(drained).lower()} yourself, in {pattern.where}"
+                message = f"is a pattern of many nodes; {flag}"
             raise InvalidInput.at("NODE", message)
         host, verb = config.host_of(node), "Drain" if drained else "Undrain"
         if config.nodes[host].drained is drained:
@@ -400,21 +384,17 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             if drained:
                 plan = relocation.with_moves(plan, after, after.usage, after.names)
             lines = [*(f"moves: {text}" for text in plan.moved), *plan.stays]
-            lines += [] if drained else [*_kept_away(host, after)]
+            # what an override moved away comes back with its end
+            for name, override in () if drained else sorted(after.config.overrides.items()):
+                moves_it = override.node not in (None, host) and name not in after.ledger.ended
+                if moves_it and any(matches(host, each.nodes or ()) for each in override.select):
+                    way = f"to end that: {shlex.join(['demandops', 'override', 'end', name])}"
+                    lines.append(f"{override.path} still moves it all to '{override.node}'; {way}")
             data = {"node": host, "moved": [*plan.moved], "stays": [*plan.stays]}
             return data, (f"  {line}" for line in lines or ["moves nothing"])
 
         summary, branch = f"{verb} {host}", f"{verb.lower()}/{host}"
         person_change.commit(repo, {path: changed}, summary, branch, options, moves)
-
-
-def _kept_away(host: str, state: State) -> Iterator[str]:
-    # what an override moved away comes back with its end
-    for name, override in sorted(state.config.overrides.items()):
-        selected = any(matches(host, selector.nodes or ()) for selector in override.select)
-        if override.node not in (None, host) and selected and name not in state.ledger.ended:
-            end = shlex.join(["demandops", "override", "end", name])
-            yield f"{override.path} still moves it all to '{override.node}'; to end that: {end}"
 
 
 _node = click.argument("node", metavar="NODE", shell_complete=names_of("nodes"))
@@ -424,11 +404,9 @@ _node = click.argument("node", metavar="NODE", shell_complete=names_of("nodes"))
 @_node
 @editing
 def drain(node: str, options: Options) -> None:
-    """Take a node out of use: the generator places nothing there.
-
-    The command sets `drained: true` in the inventory. The generator then moves away what it placed
-    on the node, and places nothing there. What a demand names the node for stays, and such demands
-    are still accepted; an override with `--on` moves it, and `demandops release` ends it.
+    """The command sets `drained: true` in the inventory. The generator then moves away what it
+    placed on the node, and places nothing there. What a demand names the node for stays, and such
+    demands are still accepted; an override with `--on` moves it, and `demandops release` ends it.
 
     \b
     Examples:
@@ -443,9 +421,8 @@ def drain(node: str, options: Options) -> None:
 @_node
 @editing
 def undrain(node: str, options: Options) -> None:
-    """Use a drained node again.
-
-    The command takes `drained: true` out of the inventory. What was moved away stays where it is.
+    """The command takes `drained: true` out of the inventory. What was moved away stays where it
+    is.
 
     \b
     Examples:
@@ -461,10 +438,8 @@ def undrain(node: str, options: Options) -> None:
 @click.argument("commit", metavar="COMMIT")
 @editing
 def revert(commit: str, options: Options) -> None:
-    """Undo a person's commit, by a new commit.
-
-    The files that COMMIT changed become what they were before it. If a file has changed since, the
-    command changes nothing. A generator's commit is undone by `demandops release` or `demandops
+    """The files that COMMIT changed become what they were before it. If a file has changed since,
+    the command changes nothing. A generator's commit is undone by `demandops release` or `demandops
     rollback`, because later demands may build on it.
 
     \b
@@ -476,9 +451,8 @@ def revert(commit: str, options: Options) -> None:
         id = repo.commit(commit)
         entry = next(repo.log(id))
         paths = repo.files_changed_by(id)
-        booked = [
-            path for path in paths if path.split("/", 1)[0] in (LEDGER_ROOT, *GENERATED_ROOTS)
-        ]
+        generated = (LEDGER_ROOT, *GENERATED_ROOTS)
+        booked = [path for path in paths if path.split("/", 1)[0] in generated]
         if entry.by_generator or booked:
             who = "a generator made it" if entry.by_generator else f"it changes {booked[0]}"
             snapshot, demands = repo.snapshot(), entry.trailers.get("Demand-Id", ())
@@ -499,10 +473,7 @@ def revert(commit: str, options: Options) -> None:
             message = f"has changed since commit {id[:10]}; revert it with git, and push"
             raise InvalidInput.at("", message, file=changed[0])
         files = {path: before(path) for path in paths}
-        summary = f'Revert "{entry.summary}"'
+        summary, branch, more = f'Revert "{entry.summary}"', f"revert/{id[:10]}", {"reverts": id}
         reason = f"This reverts commit {id}. {options.reason}".rstrip()
-        branch = f"revert/{id[:10]}"
-        more = {"reverts": id}
-        person_change.commit(
-            repo, files, summary, branch, replace(options, reason=reason), lambda *_: (more, ())
-        )
+        options = replace(options, reason=reason)
+        person_change.commit(repo, files, summary, branch, options, lambda *_: (more, ()))

@@ -23,20 +23,12 @@ from demandops.base.errors import (
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
-from demandops.cli.changes import ledger_change
-from demandops.cli.changes.ledger_change import started_generator
-from demandops.cli.changes.person_change import confirm, consequence
+from demandops.cli import target
+from demandops.cli.changes.ledger_change import await_answer, follows, started_generator
+from demandops.cli.changes.person_change import confirm
 from demandops.cli.formats import faults_of, output_option, print_json
 from demandops.cli.output import busy, done, errors, say
 from demandops.cli.queries.commits import release_lines
-from demandops.cli.target import (
-    NO_STATE_REPO,
-    dry_run_option,
-    hint_to_pull,
-    hint_to_push,
-    optional_repo_option,
-    signing_option,
-)
 from demandops.decide.decision import Decision, decide
 from demandops.decide.state import effects_of
 from demandops.model.config.base_model import duration_text
@@ -72,8 +64,8 @@ class Document:
     help="Book directly in the state repo (git), or send to a running node (ros). Default: git, if "
     "a state repo is at hand.",
 )
-@optional_repo_option
-@dry_run_option
+@target.optional_repo_option
+@target.dry_run_option
 @click.option("--release", is_flag=True, help="Release the demands of the documents instead.")
 @click.option("-y", "--yes", is_flag=True, help="With --release, do not ask.")
 @click.option("--renew", is_flag=True, help="Renew the demands of the documents instead.")
@@ -97,7 +89,7 @@ class Document:
     metavar="SECONDS",
     help="Over ROS: how long to wait for the node and its answer together. Default: 60.",
 )
-@signing_option
+@target.signing_option
 @output_option
 def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     files: tuple[str, ...],
@@ -114,13 +106,11 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     signing_key: Path | None,
     output: str,
 ) -> None:
-    """Demand what files ask for: book it, or send it to a node.
-
-    FILE contains documents of the kind Demand (docs/demand.md), or goals of the action
+    """FILE contains documents of the kind Demand (docs/demand.md), or goals of the action
     DeploymentRequest as YAML, as for `ros2 action send_goal`. Write - for standard input. With a
     state repo at hand, the command books directly in it; otherwise, and with --via ros, it sends
-    the goals over ROS 2 to a running node. If it cannot parse one of the
-    documents, it takes none. Otherwise it takes the documents in order, also if one is refused.
+    the goals over ROS 2 to a running node. If it cannot parse one of the documents, it takes none.
+    Otherwise it takes the documents in order, also if one is refused.
 
     \b
     Examples:
@@ -135,12 +125,12 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     of_ros = hold or action is not None or timeout is not None
     over_ros = via == "ros" or (via is None and (of_ros or not state_repo))
     if over_ros and (dry_run or wait):
-        only = "--dry-run" if dry_run else "--wait"
-        raise click.UsageError(f"{only} needs a state repo, and not --via ros; {NO_STATE_REPO}")
+        needs = f"{'--dry-run' if dry_run else '--wait'} needs a state repo, and not --via ros"
+        raise click.UsageError(f"{needs}; {target.NO_STATE_REPO}")
     if not over_ros and of_ros:
         raise click.UsageError("--hold, --action and --timeout are for --via ros")
     if not over_ros and not state_repo:
-        raise click.UsageError(NO_STATE_REPO)
+        raise click.UsageError(target.NO_STATE_REPO)
     documents = []
     for file in files:
         name, text = read_input(file)
@@ -163,26 +153,25 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     else:
         if is_unread:
             message = "not booked, because another request of the same command cannot be parsed"
+            unread = (form_faults(each.goal) or [fault("", message)] for each in documents)
             rows = [
-                _refused(
-                    index,
-                    document,
-                    InvalidInput(form_faults(document.goal) or [fault("", message)]),
-                )
-                for index, document in enumerate(documents)
+                _refused(index, document, InvalidInput(faults))
+                for index, (document, faults) in enumerate(zip(documents, unread, strict=True))
             ]
         elif dry_run:
             rows = _dry_run(documents, state_repo, output)
         else:
             if release and not yes:
-                _confirm_release(documents, state_repo)
+                decided = [each for _, _, each in _decided(documents, state_repo)]
+                for line in follows([each for each in decided if isinstance(each, Decision)]):
+                    errors.print(line)
+                confirm("Continue?", yes)
             rows = _book(documents, state_repo, wait, signing_key)
         _show_rows(rows, documents, output, dry_run)
     if via is None and output == "text" and not is_unread:
         way = f"directly in the state repo {state_repo}; to send it to a node: --via ros"
         errors.print("(by a node, over ROS)" if over_ros else f"({way})")
-    unanswered = sum(_is_unanswered(row) for row in rows) if not dry_run else 0
-    if unanswered:
+    if unanswered := sum(_is_unanswered(row) for row in rows) if not dry_run else 0:
         errors.print(f"{len(rows) - unanswered} of {len(rows)} requests have an answer")
         raise click.Abort
     if any(row["outcome"] in ("refused", "unknown") for row in rows):
@@ -283,7 +272,7 @@ def _book(
             for document in documents:
                 submit(generator, document)
             for number, answer in enumerate(answers, start=1):
-                ledger_change.await_answer(answer)
+                await_answer(answer)
                 report(number, len(documents))
     except KeyboardInterrupt:
         if not has_started:
@@ -341,17 +330,6 @@ def _decided(
             state = decision.state
             written.update(decision.files)
             yield index, document, decision
-
-
-def _confirm_release(documents: list[Document], state_repo: str) -> None:
-    decisions = [each for _, _, each in _decided(documents, state_repo)]
-    released = [each for each in decisions if not isinstance(each, InvalidInput)]
-    changes = [change for each in released for change in each.changes.claims]
-    claims = [change.before for change in changes if change.before and change.only_narrows]
-    who = {name for claim in claims for name in claim.requesters}
-    for line in consequence([r for each in released for r in each.releases], who, claims):
-        errors.print(line)
-    confirm("Continue?", yes=False)
 
 
 def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Json]:
@@ -422,8 +400,8 @@ def _show_rows(  # noqa: PLR0912 - a part of a row each
         for item in row["not_held"]:
             errors.print(f"  listed, but not held by the requester: {item}")
     if not dry_run and any(row["outcome"] in ("booked", "released") for row in rows):
-        for line in hint_to_pull():
+        for line in target.hint_to_pull():
             errors.print(line)
     codes = {each["code"] for row in rows for each in row["faults"]}
-    for line in hint_to_push() if codes & {"unknown-application", "unknown-node"} else ():
+    for line in target.hint_to_push() if codes & {"unknown-application", "unknown-node"} else ():
         errors.print(line)

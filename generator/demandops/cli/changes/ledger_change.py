@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -27,7 +27,7 @@ from demandops.cli.formats import show
 from demandops.cli.output import busy, done, errors, fitted, terminal_width
 from demandops.cli.queries.commits import resolved
 from demandops.cli.target import name_options, names_of, options_for
-from demandops.decide.decision import decide
+from demandops.decide.decision import Decision, decide
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.demand import goals
@@ -102,15 +102,9 @@ def _book(
             if not is_known or {fault.code for fault in error.faults} != {"not-held"}:
                 raise
             return data, (), []
-    changes = decision.changes.claims
-    data |= {
-        "outcome": decision.outcome,
-        "releases": [asdict(release) for release in decision.releases],
-    }
-    less = [change.before for change in changes if change.before and change.only_narrows]
-    who = {name for claim in less for name in claim.requesters}
-    lines = [f"would be {told(change)}" for change in changes]
-    lines += consequence(decision.releases, who, less)
+    changes, releases = decision.changes.claims, [asdict(each) for each in decision.releases]
+    data |= {"outcome": decision.outcome, "releases": releases}
+    lines = [*(f"would be {told(change)}" for change in changes), *follows([decision])]
     lines = [fitted(line, terminal_width()) for line in lines]
     if options.dry_run:
         return data, changes, lines
@@ -127,6 +121,13 @@ def _book(
     done.append(f"{receipt.outcome} in {receipt.commit}")
     data |= {"outcome": receipt.outcome, "commit": receipt.commit}
     return data, receipt.changes, [*map(told, receipt.changes)]
+
+
+def follows(decisions: Collection[Decision]) -> Iterator[str]:
+    changes = [change for decision in decisions for change in decision.changes.claims]
+    less = [change.before for change in changes if change.before and change.only_narrows]
+    who = {name for claim in less for name in claim.requesters}
+    return consequence([each for made in decisions for each in made.releases], who, less)
 
 
 def claim_text(change: ClaimChange) -> str:
@@ -163,13 +164,10 @@ def _end(name: str, kinds: Sequence[str], options: Options) -> None:
     if data["outcome"] == "unchanged":
         lines = [f"'{ended}' holds nothing"]
     elif data["commit"]:
-        lines.append(
-            f"'{ended}' is {'released' if is_release else 'decommissioned'} in {data['commit']}"
-        )
-        if is_release:
-            lines.append(
-                "if it is demanded again, it runs again; `demandops suspend` prevents that"
-            )
+        word = "released" if is_release else "decommissioned"
+        lines.append(f"'{ended}' is {word} in {data['commit']}")
+        again = "if it is demanded again, it runs again; `demandops suspend` prevents that"
+        lines += [again] if is_release else []
     # of an application the claims end, and what else their demands list stays
     demands, keys = {change.key.demand for change in changes}, {change.key for change in changes}
     kept = sorted({str(c.subject) for c in before if c.demand in demands and c.key not in keys})
@@ -206,16 +204,14 @@ def _meant(name: str, kinds: Iterable[str], state: State, earlier: State | None 
     for kind, names in known.items():
         if name in names:
             command = "decommission" if kind in ("node", "requester") else "release"
-            article = "an" if kind == "application" else "a"
-            message = f"'{name}' is {article} {kind}; run: demandops {command} {shlex.quote(name)}"
             demands = sorted({claim.demand for claim in ledger if name in claim.requesters})
+            way = "run"
             if command == "decommission" and demands:
-                message = (
-                    f"'{name}' is {article} {kind}; to stop one demand, name it: "
-                    f"{fitted(', '.join(demands), 200)}; to release all that it holds, run: "
-                    f"demandops {command} {shlex.quote(name)}"
-                )
-            raise InvalidInput.at("", message)
+                way = f"to stop one demand, name it: {fitted(', '.join(demands), 200)}; to release "
+                way += "all that it holds, run"
+            is_a = f"is {'an' if kind == 'application' else 'a'} {kind}"
+            command = f"demandops {command} {shlex.quote(name)}"
+            raise InvalidInput.at("", f"'{name}' {is_a}; {way}: {command}")
     return name
 
 
@@ -234,9 +230,7 @@ def _only(kind: str, other: str) -> Callable[..., Any]:
 @_only("application", "demand")
 @changing()
 def release(name: str, kind: str | None, options: Options) -> None:
-    """Stop one demand, or an application for all who demand it.
-
-    DEMAND is the id of a demand or of its request, or the start of a demand's id: all its claims
+    """DEMAND is the id of a demand or of its request, or the start of a demand's id: all its claims
     are released, also if it waits for room. Of an APPLICATION, the claims of all demands are
     released; what else these demands hold stays. What others need runs on. Whoever demands it again
     gets it again: to keep it from running, see `demandops suspend`.
@@ -255,9 +249,7 @@ def release(name: str, kind: str | None, options: Options) -> None:
 @_only("requester", "node")
 @changing()
 def decommission(name: str, kind: str | None, options: Options) -> None:
-    """Release all claims of a node or a requester.
-
-    For a node, the command releases the applications on the node, the inputs that come from the
+    """For a node, the command releases the applications on the node, the inputs that come from the
     node, the deliveries to the node, and the connections from and to the node, for every requester.
     Then you can delete the node from the inventory. For a requester, the command releases all
     claims of this requester, even claims that also name other requesters. It also ends the waiting
@@ -299,13 +291,11 @@ _MOST_EDITS = 5
 def rollback(
     revision: str, demand: str, application: str, drop_newer: bool, options: Options
 ) -> None:
-    """Restore the claims of an earlier commit, by a new commit.
-
-    Claims that were released after the earlier commit are booked again, with the current
-    configuration. Claims that were booked or changed after it prevent the rollback, unless
-    you give --drop-newer. The lease of a restored claim starts again with its full term. REV is a
-    commit. TIME selects the newest commit at or before this time. Without both, --demand or
-    --application means the commit before its last change.
+    """Claims that were released after the earlier commit are booked again, with the current
+    configuration. Claims that were booked or changed after it prevent the rollback, unless you give
+    --drop-newer. The lease of a restored claim starts again with its full term. REV is a commit.
+    TIME selects the newest commit at or before this time. Without both, --demand or --application
+    means the commit before its last change.
 
     \b
     Examples:

@@ -21,17 +21,15 @@ import click
 
 from demandops.base import settings
 from demandops.base.errors import InvalidInput, suggestion
-from demandops.base.quoting import harmless, one_line
+from demandops.base.quoting import count, harmless, one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cli import formats, target
 from demandops.cli.output import busy, done, errors, fitted, terminal_width
 from demandops.cli.queries.commits import differences, entry_lines, release_lines
 from demandops.decide.planning.overrides import suspended_claims
-from demandops.decide.planning.planner import ReleaseKey
 from demandops.decide.state import (
     FileChange,
-    FileReader,
     ReleaseChange,
     State,
     described,
@@ -59,8 +57,6 @@ from demandops.repo.write.proposal_branch import (
 from demandops.serve.proposal import merge_request
 from demandops.views import vocabulary
 from demandops.views.vocabulary import Json
-
-Releases = Mapping[ReleaseKey, Release]
 
 # ---- the options of all these commands ----
 
@@ -136,10 +132,6 @@ def confirm(question: str, yes: bool) -> None:
         raise click.ClickException("nothing was changed")
 
 
-def count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
-
-
 def consequence(
     releases: Collection[ReleaseChange],
     who: Collection[str],
@@ -183,12 +175,6 @@ def _runs(release: Release | None) -> bool:
     )
 
 
-def _stopped(old: Releases, new: Releases, read: FileReader) -> list[Release]:
-    # what has no file has not started yet
-    ended = (each for key, each in old.items() if _runs(each) and not _runs(new.get(key)))
-    return [release for release in ended if read(path_of(release)) is not None]
-
-
 @contextmanager
 def writable(options: Options) -> Iterator[Reader]:
     # a dry run writes nothing, so the state repo may also be a checkout
@@ -203,7 +189,7 @@ def commit(
     summary: str,
     branch: str,
     options: Options,
-    more: Callable[[State, State], tuple[Json, Iterable[str]]] = lambda before, after: ({}, ()),
+    more: Callable[[State, State], tuple[Json, Iterable[str]]],
 ) -> None:
     """Commit files to main, or to ``branch``, once the person has seen what follows.
 
@@ -227,7 +213,9 @@ def commit(
             change = described(was, now, text(was, before.state), text(now, after))
             changes += [change] if change.change != "change" or change.details else []
     changes.sort(key=lambda change: (change.change, change.name))
-    stopped = _stopped(old, new, repo.file_reader())
+    ended = (each for key, each in old.items() if _runs(each) and not _runs(new.get(key)))
+    read = repo.file_reader()  # what has no file has not started yet
+    stopped = [release for release in ended if read(path_of(release)) is not None]
     who = {name for r in stopped for name in requesters_of(claims_of(r, before.state.ledger))}
     suspended = {claim.key for claim, _ in suspended_claims(before.state)}
     claims = [claim for claim, _ in suspended_claims(after) if claim.key not in suspended]
@@ -245,9 +233,9 @@ def commit(
         **of_command,
     }
     if options.dry_run:
-        current, shown = repo.file_reader(), list[str]()
+        shown = list[str]()
         for path, content in files.items():
-            file = FileChange(path, current(path), content)
+            file = FileChange(path, read(path), content)
             diff = file.diff() if file.before else (content or "").splitlines()
             shown += [f"    {line}" for line in diff]
         formats.show(options.output, data, [*told, *shown, "nothing was changed"])
@@ -255,8 +243,7 @@ def commit(
     for line in told if options.output == "text" else ():
         errors.print(line)
     confirm("Continue?", options.yes)
-    reason = one_line(options.reason)
-    person = warned_if_unnamed(repo.operator())
+    reason, person = one_line(options.reason), warned_if_unnamed(repo.operator())
     details = CommitDetails(person, REAL.now(), summary, reason)
     if not options.propose:
         published = person_commit.commit_to_main(repo.repository, files, details)
@@ -266,8 +253,7 @@ def commit(
             *target.hint_to_pull(),
         ]
     else:
-        title = harmless(one_line(summary))
-        proposals = before.state.config.repo_settings.proposals
+        title, proposals = harmless(one_line(summary)), before.state.config.repo_settings.proposals
         # only GitLab opens a merge request for a push
         asked = merge_request(title, reason) if proposals.forge == "gitlab" else []
         published = person_commit.commit_to_branch(repo.repository, files, details, branch, asked)
@@ -339,9 +325,7 @@ def _proposal(repo: Reader, name: str, commit: str, output: str) -> PendingPropo
 @_named
 @_answering
 def approve(name: str, commit: str, options: Options) -> None:
-    """Approve a proposal: merge its branch in your own name.
-
-    At a terminal, the command first shows what the merge would change, and asks. Elsewhere, and
+    """At a terminal, the command first shows what the merge would change, and asks. Elsewhere, and
     with --yes, name the commit that you looked at: --commit ID. If the branch is at another commit,
     the command merges nothing. The generator then answers the demand and removes the branch. If
     main has changed the same files since the proposal was made, the command merges nothing either.
@@ -376,13 +360,12 @@ def approve(name: str, commit: str, options: Options) -> None:
         person = warned_if_unnamed(repo.operator())
         details = CommitDetails(person, REAL.now(), summary, options.reason)
         merged = person_commit.merge(repo.repository, proposal, details)
-        done.append(f"{proposal.branch} is merged in {merged.commit}")
+        told = f"{proposal.branch} is merged in {merged.commit}"
+        done.append(told)
         if proposal.branch.startswith(OF_PEOPLE):  # a generator removes only its own branches
             _remove(repo, proposal)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": merged.commit}
-    formats.show(
-        options.output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"]
-    )
+    formats.show(options.output, data, [f"approved: {told}"])
 
 
 # ---- ``demandops reject``: refuse a proposal ----
@@ -392,9 +375,7 @@ def approve(name: str, commit: str, options: Options) -> None:
 @_named
 @_answering
 def reject(name: str, commit: str, options: Options) -> None:
-    """Reject a proposal: delete its branch, and record who and why.
-
-    The requester gets the reason, which must be given; the generator aborts the goal with
+    """The requester gets the reason, which must be given; the generator aborts the goal with
     `turned-down`. If the branch has changed since the command read it, the command changes nothing.
 
     \b

@@ -10,13 +10,7 @@ from typing import Any, get_args
 
 import click
 
-from demandops.base.errors import (
-    BeforeTheFirst,
-    InvalidInput,
-    StateRepoError,
-    fault,
-    suggestion,
-)
+from demandops.base.errors import BeforeTheFirst, InvalidInput, StateRepoError, fault, suggestion
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli.formats import Table, list_table, output_formats, output_option, show
@@ -45,9 +39,7 @@ from demandops.views.vocabulary import commit_data
 @at_option
 @output_formats("text", "wide", "json")
 def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
-    """Show who requests which service and connection.
-
-    What one of them holds: demandops get demands --requester NAME, and demandops get requesters.
+    """What one of them holds: demandops get demands --requester NAME, and demandops get requesters.
 
     \b
     Examples:
@@ -85,10 +77,8 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
 @state_repo_option
 @output_option
 def diff(before: str, after: str, state_repo: str, output: str) -> None:
-    """Show the differences between two commits.
-
-    The command compares the bookkeeping, the releases and other files below clusters/. A and B are
-    commits, or times like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
+    """The command compares the bookkeeping, the releases and other files below clusters/. A and B
+    are commits, or times like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
     Without B, it shows what has changed since A.
 
     \b
@@ -124,10 +114,10 @@ def differences(
     old, new = (loaded(repo, revision) for revision in (before, after))
     commits = str(old.commit), str(new.commit)
     differing = repo.changed_files(*commits, (CLUSTERS_ROOT,))
-    texts = []
-    for read in map(repo.file_reader, commits):
-        read_texts = {path: read(path) for path in differing}
-        texts.append({path: text for path, text in read_texts.items() if text is not None})
+    texts = (
+        {path: text for path in differing if (text := read(path)) is not None}
+        for read in map(repo.file_reader, commits)
+    )
     entries = bookkeeping_changes(derive(old.state), derive(new.state))
     planned = planned_releases(old.state), planned_releases(new.state)
     return entries, preview(*planned, *texts)
@@ -252,10 +242,9 @@ def log(
     output: str,
     **given: Any,  # noqa: ANN401 - the filters
 ) -> None:
-    """List the commits of the state repo, newest first.
-
-    If you give several filters, a commit must match all of them. REV, A and B are commits, or times
-    written as for --since. -o wide adds the absolute times, operations, authors and request ids.
+    """If you give several filters, a commit must match all of them. REV, A and B are commits, or
+    times written as for --since. -o wide adds the absolute times, operations, authors and request
+    ids.
 
     \b
     Examples:
@@ -302,7 +291,7 @@ def log(
             if not (entries := list(islice(filter(matches, commits), max_count))):
                 _refuse_unknown(repo, given)
     table = log_table(entries, REAL.now(), wide=output == "wide")
-    rows = [commit_data(entry) for entry in entries]
+    rows = [*map(commit_data, entries)]
     show(output, rows, [table if entries else "no commit matches"])
 
 
@@ -312,22 +301,16 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
     for entry in repo.log() if names else ():
         for name, values in names.items():
             values.update(_named(entry, name))
-    faults = [
-        fault(
-            f"--{name}",
-            f"no commit is about {quoted(given[name])}{suggestion(given[name], values)}",
-        )
-        for name, values in names.items()
-        if given[name] not in values
-    ]
+    faults = []
+    for name, values in names.items():
+        if (wanted := given[name]) not in values:
+            message = f"no commit is about {quoted(wanted)}{suggestion(wanted, values)}"
+            faults.append(fault(f"--{name}", message))
     if (node := given["node"]) is not None:
         # no commit needs to have changed a node that the inventory has
-        config = repo.snapshot().state.config
-        if not config.has_node(node) and not any(
-            repo.changes_node(entry.commit, node) for entry in repo.log()
-        ):
-            message = f"{quoted(node)} {config.why_no_node(node)}"
-            faults.append(fault("--node", message))
+        config, commits = repo.snapshot().state.config, (entry.commit for entry in repo.log())
+        if not config.has_node(node) and not any(repo.changes_node(id, node) for id in commits):
+            faults.append(fault("--node", f"{quoted(node)} {config.why_no_node(node)}"))
     if faults:
         raise InvalidInput(faults)
 

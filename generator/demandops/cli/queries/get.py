@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -11,7 +10,7 @@ from typing import Any
 
 import click
 
-from demandops.base import settings, strict_yaml
+from demandops.base import settings
 from demandops.base.errors import InvalidInput, fault, suggestion
 from demandops.base.naming import SubjectKind
 from demandops.base.quoting import quoted
@@ -118,9 +117,7 @@ def get(
     output: str,
     **asked: Any,  # noqa: ANN401 - the other options
 ) -> None:
-    """List demands, releases, nodes, overrides and so on.
-
-    KIND is demands, applications, releases, services, connections, leases, requesters, nodes,
+    """KIND is demands, applications, releases, services, connections, leases, requesters, nodes,
     domains, appdefs, claims, overrides, proposals or events. A proposal is a branch that a person
     merges to approve its demands, or deletes to refuse them. NAME and the values of filters may be
     patterns with * and ?. If you give several filters, an item must match all of them. The state of
@@ -145,7 +142,8 @@ def get(
     if asked["gone"] and (watch or not listed.has_past):
         past = ", ".join(name for name, each in KINDS.items() if each.has_past)
         raise click.UsageError(f"--gone lists {past}, without --watch")
-    wanted, since = _labels_wanted(asked), asked["since"]
+    wanted = _labels_wanted(asked)
+    since: datetime | None = asked["since"]
     columns, sort_by = {column.key: column for column in listed.columns}, asked["sort_by"] or ""
     by = sort_by.removeprefix("-").lower()
     if sort_by and by not in columns:
@@ -161,15 +159,18 @@ def get(
             source = _with_proposals(source, repo)
         return ask_clusters(source, repo, clusters) if clusters else source
 
-    def choose(rows: list[Row]) -> list[Row]:
-        chosen = Filter(" ".join(exactly(label, value) for label, value, _ in wanted))
-        rows = [
-            row
-            for row in rows
-            if (not names or any(matches(name, names) for name in row.labels[listed.word]))
+    chosen = Filter(" ".join(exactly(label, value) for label, value, _ in wanted))
+
+    def is_chosen(row: Row) -> bool:
+        began = row.item.get("time") or row.item.get("since")
+        return (
+            (not names or any(matches(name, names) for name in row.labels[listed.word]))
             and chosen.matches(row)
-            and (since is None or (_began(row) or since) >= since)
-        ]
+            and (since is None or not began or parse_time(began) >= since)
+        )
+
+    def choose(rows: list[Row]) -> list[Row]:
+        rows = [*filter(is_chosen, rows)]
         return sorted_rows(rows, columns[by], source.now, down=sort_by != by) if sort_by else rows
 
     with reader.opened(state_repo) as repo:
@@ -208,11 +209,6 @@ def _labels_wanted(asked: Mapping[str, Any]) -> list[tuple[str, str, str]]:
             raise click.UsageError(f"--selector: {quoted(selector)} is not LABEL=VALUE")
         wanted.append((label.strip(), value.lstrip("=").strip(), "--selector"))
     return wanted
-
-
-def _began(row: Row) -> datetime | None:
-    time = row.item.get("time") or row.item.get("since")
-    return parse_time(time) if time else None
 
 
 def _with_proposals(source: Source, repo: Reader) -> Source:
@@ -300,16 +296,16 @@ def _print_list(
     kind: Kind, source: Source, rows: list[Row], output: str, watch: bool, *, gone: bool = False
 ) -> None:
     items = [row.item for row in rows]
-    plain = json.loads(json.dumps({"kind": kind.name, "commit": source.commit, "items": items}))
-    if output == "json" and watch:
-        click.echo(formats.json_text(plain))
-    elif output == "yaml":
-        click.echo(("---\n" if watch else "") + strict_yaml.dump(plain), nl=False)
-    else:
-        shown: list[str | Table] = [item["name"] for item in items]
-        if output != "name":
-            table = list_table(kind, rows, source.now, wide=output == "wide")
-            more = "; --gone lists what was" if kind.has_past and not gone else ""
-            shown = [replace(table, empty=table.empty + more)]
-            shown += [f"{source.now:%H:%M:%S} UTC, at {source.commit[:10]}"] if watch else []
-        formats.show(output, plain, shown)
+    data = {"kind": kind.name, "commit": source.commit, "items": items}
+    if watch and output == "json":
+        click.echo(formats.json_text(data))
+        return
+    if watch and output == "yaml":
+        click.echo("---")
+    shown: list[str | Table] = [item["name"] for item in items]
+    if output in ("text", "wide"):
+        table = list_table(kind, rows, source.now, wide=output == "wide")
+        more = "; --gone lists what was" if kind.has_past and not gone else ""
+        shown = [replace(table, empty=table.empty + more)]
+        shown += [f"{source.now:%H:%M:%S} UTC, at {source.commit[:10]}"] if watch else []
+    formats.show(output, data, shown)

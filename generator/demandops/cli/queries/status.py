@@ -14,6 +14,7 @@ from pathlib import Path
 import click
 
 from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
+from demandops.base.quoting import count
 from demandops.base.runtime import REAL
 from demandops.cli.formats import Table, list_table, output_formats, output_option, show
 from demandops.cli.output import busy, errors, painted, read_by, warn_of_not_rendered
@@ -71,10 +72,8 @@ def status(
     request_timeout: int,
     output: str,
 ) -> None:
-    """Show the state of each release on its cluster.
-
-    The state is the commit that the cluster has applied, and the health of the release. The state
-    of a cluster without a kubeconfig in --clusters is unknown.
+    """The state is the commit that the cluster has applied, and the health of the release. The
+    state of a cluster without a kubeconfig in --clusters is unknown.
 
     \b
     The exit code is 1 if
@@ -123,7 +122,7 @@ def status(
         }
         text: list[str | Table] = [f"  {problem}" for problem in source.problems]
         if text:
-            text.insert(0, "1 problem:" if len(text) == 1 else f"{len(text)} problems:")
+            text.insert(0, f"{count(len(text), 'problem')}:")
         if source.snapshot.faults:
             text.append(in_effect(repo, source.snapshot))
     rows = rows_of(source, "releases")
@@ -224,9 +223,7 @@ def amiss(source: Source, clusters: Mapping[str, ClusterAccess]) -> str:
 def reconcile(
     cluster: str | None, every: bool, state_repo: str, access_file: Path | None, output: str
 ) -> None:
-    """Let Flux or Argo CD fetch now, and not at its next interval.
-
-    The controller is woken as --clusters says: by its webhook, or by the cluster's API.
+    """The controller is woken as --clusters says: by its webhook, or by the cluster's API.
 
     \b
     Examples:
@@ -274,10 +271,8 @@ _OTHER_LINES = 6
 @state_repo_option
 @clusters_option
 def watch(state_repo: str, access_file: Path | None) -> None:
-    """Show releases, demands and the latest commits live.
-
-    Releases that are not healthy come first. The health is known only with --clusters. Ctrl-C ends
-    the command.
+    """Releases that are not healthy come first. The health is known only with --clusters. Ctrl-C
+    ends the command.
 
     \b
     Examples:
@@ -360,10 +355,8 @@ def _part(title: str, table: Table, width: int, room: int) -> list[str]:
     "current.",
 )
 def web(state_repo: str, listen: str, access_file: Path | None, interval: float) -> None:
-    """Show the state repo on a web page.
-
-    The page follows the state repo. It shows what is not ready and why, a map, lists, a time line,
-    each release, and overrides. It changes nothing. Stop it with Ctrl-C or SIGTERM.
+    """The page follows the state repo. It shows what is not ready and why, a map, lists, a time
+    line, each release, and overrides. It changes nothing. Stop it with Ctrl-C or SIGTERM.
 
     \b
     Examples:

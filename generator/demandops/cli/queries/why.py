@@ -76,7 +76,8 @@ def lines_of(answer: Json) -> Iterator[str]:  # noqa: PLR0912 - a part each
         word = _OF_RELEASES.get(answer["kind"], "runs")
         yield f"  {word:11} {release['name']} on {release['node']}"
     if answer.get("claims"):
-        yield from _claim_lines(answer["claims"])
+        yield "requested by"
+        yield from (line for claim in answer["claims"] for line in _claim_lines(claim))
     if answer.get("shaped_by"):
         yield "configured by"
         for place in answer["shaped_by"]:
@@ -100,41 +101,36 @@ def lines_of(answer: Json) -> Iterator[str]:  # noqa: PLR0912 - a part each
         yield from _commit_lines(answer["started"], why=True)
 
 
-def _claim_lines(claims: list[Json]) -> Iterator[str]:
-    yield "requested by"
-    for claim in claims:
-        lease, subject = claim["lease"], f"{claim['subject']['kind']} '{claim['subject']['id']}'"
-        until = f", lease of {duration_text(lease['seconds'])}" if lease else ""
-        if lease:
-            until += f" until {time_text(lease['until'])}" if lease["until"] else ", not started"
-        until += (
-            ", which has passed; a generator has yet to release the claim"
-            if claim["state"] == "overdue"
-            else ""
-        )
-        version = f", version {claim['version']}" if claim["version"] else ""
-        yield f"  {', '.join(claim['requesters'])} since {time_text(claim['since'])}, for {subject}"
-        yield f"    demand {claim['demand']}, request '{claim['request']}'{version}{until}"
-        yield f"    {claim['file']}"
-        if claim["place"] is not None:
-            required = ", ".join(f"{name} {value}" for name, value in claim["place"].items())
-            yield f"    the demand requires of the application's node: {required or 'nothing'}"
-        if claim["services"]:
-            nodes = ", ".join(f"{name} on {node}" for name, node in claim["services"].items())
-            yield f"    services on nodes of their own: {nodes}"
-        for id, outputs in claim["reads"].items():
-            yield f"    reads {', '.join(outputs)} of application '{id}'"
-        for id, outputs in claim["held_for"].items():
-            yield f"    held for application '{id}', which reads {', '.join(outputs)} of it"
-        if claim["suspended_by"]:
-            yield f"    suspended by {_override_text(claim['suspended_by'])}"
-        if claim["kept_by"]:
-            yield f"    kept by {_override_text(claim['kept_by'])}"
-            yield f"    to release it: {claim['release_by']} by pull request"
-        else:
-            # the requester's way, and a person's
-            command = shlex.join(["demandops", "release", claim["demand"]])
-            yield f"    to release it: {claim['release_by']}, or run: {command}"
+def _claim_lines(claim: Json) -> Iterator[str]:
+    lease, subject = claim["lease"], f"{claim['subject']['kind']} '{claim['subject']['id']}'"
+    until = f", lease of {duration_text(lease['seconds'])}" if lease else ""
+    if lease:
+        until += f" until {time_text(lease['until'])}" if lease["until"] else ", not started"
+    if claim["state"] == "overdue":
+        until += ", which has passed; a generator has yet to release the claim"
+    version = f", version {claim['version']}" if claim["version"] else ""
+    yield f"  {', '.join(claim['requesters'])} since {time_text(claim['since'])}, for {subject}"
+    yield f"    demand {claim['demand']}, request '{claim['request']}'{version}{until}"
+    yield f"    {claim['file']}"
+    if claim["place"] is not None:
+        required = ", ".join(f"{name} {value}" for name, value in claim["place"].items())
+        yield f"    the demand requires of the application's node: {required or 'nothing'}"
+    if claim["services"]:
+        nodes = ", ".join(f"{name} on {node}" for name, node in claim["services"].items())
+        yield f"    services on nodes of their own: {nodes}"
+    for id, outputs in claim["reads"].items():
+        yield f"    reads {', '.join(outputs)} of application '{id}'"
+    for id, outputs in claim["held_for"].items():
+        yield f"    held for application '{id}', which reads {', '.join(outputs)} of it"
+    if claim["suspended_by"]:
+        yield f"    suspended by {_override_text(claim['suspended_by'])}"
+    if claim["kept_by"]:
+        yield f"    kept by {_override_text(claim['kept_by'])}"
+        yield f"    to release it: {claim['release_by']} by pull request"
+    else:
+        # the requester's way, and a person's
+        command = shlex.join(["demandops", "release", claim["demand"]])
+        yield f"    to release it: {claim['release_by']}, or run: {command}"
 
 
 def _override_text(override: Json) -> str:
@@ -161,9 +157,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
 
 @click.command()
 @click.argument(
-    "name",
-    metavar="NAME|PATH",
-    shell_complete=names_of(*(f"{kind}s" for kind in KINDS)),
+    "name", metavar="NAME|PATH", shell_complete=names_of(*(f"{kind}s" for kind in KINDS))
 )
 @state_repo_option
 @at_option
@@ -186,9 +180,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:
-    """Explain why something runs or ran, and who decided it.
-
-    The command shows the requesters, the configuration and overrides that apply, open proposals,
+    """The command shows the requesters, the configuration and overrides that apply, open proposals,
     who approved or rejected, and the commits. NAME is the name of a thing of any kind that --kind
     lists. A part of a release's name or the start of a demand's id is enough if no other release or
     demand has it. PATH is a file in a folder of the state repo, such as clusters/ or ledger/. If
@@ -227,11 +219,9 @@ def may(
     state_repo: str,
     output: str,
 ) -> None:
-    """Say whether a requester may demand an application, and why.
-
-    APPLICATION is an application definition, or an application that is demanded now. The answer is
-    that of policy, quotas and overrides; it does not look for room on the node. The exit code is 0
-    for yes, and 1 for no.
+    """APPLICATION is an application definition, or an application that is demanded now. The answer
+    is that of policy, quotas and overrides; it does not look for room on the node. The exit code is
+    0 for yes, and 1 for no.
 
     \b
     Examples:
