@@ -344,7 +344,7 @@ class _Edit:
                 "check with the same program version as the generator, or run `demandops upgrade` "
                 "to render everything again"
             )
-            raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
+            raise InvalidInput.at("renderVersion", message, file=ROOT_FILE)
         return config
 
     def merged_state(self, config: Config, ledger: Ledger) -> State:
