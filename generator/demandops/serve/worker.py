@@ -318,8 +318,7 @@ class Worker:
                 demand = restoration(self._repository.objects, demand)
             state = commits.head.state
             # of all services, once for each configuration; that is not this demand's work
-            state.usage()
-            state.names()
+            _ = state.usage, state.names
             # what was booked must be released or restored, however long all of it takes
             with processor_time(each=DEMAND_S, together=DEMAND_S if demand.adds_claims else inf):
                 decision = decide(
