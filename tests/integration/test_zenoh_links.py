@@ -15,8 +15,8 @@ import pytest
 import yaml
 import zenoh
 
+from tests.e2e.rig.net import free_port
 from tests.golden.cases import rendered
-from tests.kit.http import free_port
 from tests.kit.rig import wait_until
 
 STEP = "2-station00-joins"

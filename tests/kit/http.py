@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
-import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -16,14 +14,6 @@ from pathlib import Path
 from typing import Any
 
 _CHUNKED = ("Transfer-Encoding", "chunked")
-
-
-def free_port() -> int:
-    """Return a port that no server has, and that Linux gives to no socket by itself."""
-    while True:
-        port = random.randint(61_000, 65_535)
-        with suppress(OSError), socket.create_server(("127.0.0.1", port)):
-            return port
 
 
 @dataclass(frozen=True)

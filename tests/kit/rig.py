@@ -53,8 +53,8 @@ def restart(address: str | Path) -> bool:
     return Generator(str(address)).close(timeout=PATIENCE_S)
 
 
-def receipt(ticket: Ticket, timeout: float = PATIENCE_S) -> Receipt:
-    return ticket.future.result(timeout)
+def receipt(ticket: Ticket) -> Receipt:
+    return ticket.future.result(PATIENCE_S)
 
 
 def outcome(ticket: Ticket) -> str:
@@ -81,18 +81,17 @@ def book(generator: Generator, *goals: Goal) -> list[Receipt]:
 
 
 class Gate:
-    """A listener that blocks the worker at a stage of a demand until a test sets ``open``.
+    """A listener that blocks the worker at an admitted demand until a test sets ``open``.
 
     After ``PATIENCE_S``, it blocks no longer.
     """
 
-    def __init__(self, stage: str = "admitted") -> None:
-        self._stage = stage
+    def __init__(self) -> None:
         self.reached = threading.Event()
         self.open = threading.Event()
 
     def __call__(self, stage: str, text: str) -> None:
-        if stage == self._stage:
+        if stage == "admitted":
             self.reached.set()
             self.open.wait(PATIENCE_S)
 
@@ -121,10 +120,10 @@ class Stages:
         return [stage for stage, _ in self.told]
 
 
-def wait_until(true: Callable[[], object], what: str, timeout: float = PATIENCE_S) -> None:
-    end = time.monotonic() + timeout
+def wait_until(true: Callable[[], object], what: str) -> None:
+    end = time.monotonic() + PATIENCE_S
     while not true():
-        assert time.monotonic() < end, f"not true within {timeout:.0f} s: {what}"
+        assert time.monotonic() < end, f"not true within {PATIENCE_S:.0f} s: {what}"
         time.sleep(0.01)
 
 

@@ -91,9 +91,9 @@ class Served:
         data: dict[str, Any] = json.loads(self.demandops("bookkeeping", "--output", "json"))
         return data
 
-    def wait_for(self, text: str, seconds: float = PATIENCE_S) -> None:
+    def wait_for(self, text: str) -> None:
         """Wait until the log contains ``text``; else fail with :meth:`last_words`."""
-        end = time.monotonic() + seconds
+        end = time.monotonic() + PATIENCE_S
         while text not in self.log.read_text():
             is_over = self.process.poll() is not None or time.monotonic() > end
             if is_over and text not in self.log.read_text():

@@ -73,7 +73,7 @@ def test_who_comes_near_demands_until_it_leaves_and_rules_are_reloaded(
     client.wait(lambda: {*names} <= {*client.node.get_node_names()})
     client.wait(warns_of("demands"))
     rules.write_text(rules_of(near={"source": "vehicle"}))
-    fault = "rules.yaml:9: rules[0].near.stop: is missing; add it; the last valid"
+    fault = "rules.yaml:10: rules[0].near.stop: is missing; add it; the last valid"
     client.wait(lambda: fault in detecting.log.read_text())
     client.wait(warns_of("rules"))
     rules.write_text(rules_of())

@@ -245,7 +245,7 @@ class World(MemoryRepo):
         """Check that the files are exactly those of the ledger and of the ledger's releases."""
         assert ledger_in(self.files) == self.state.ledger
         counted = whole_usage(self.state).amounts
-        assert self.state.usage().amounts == counted, "a change updates what nodes have left"
+        assert self.state.usage.amounts == counted, "a change updates what nodes have left"
         asked = rendered_files(self.state, self.files)
         there = {p: text for p, text in self.files.items() if p in asked or p in self.rendered()}
         names = sorted(there.keys() ^ asked.keys())

@@ -14,6 +14,7 @@ import re
 import ssl
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 
 from demandops import __version__
 from demandops.base.errors import DemandOpsError
@@ -83,14 +84,12 @@ def call(
             client.stream(method, url, headers=headers, content=body) as answer,
         ):
             content = b""
-            for chunk in answer.iter_raw():
+            for chunk in chain(answer.iter_raw(), [b""]):  # its end may come late, too
                 content += chunk
                 if len(content) > _MOST_BYTES:
                     raise NoAnswer(f"the answer is longer than {_MOST_BYTES} bytes; check the URL")
                 if REAL.monotonic() > end:
                     raise NoAnswer(too_slow)
-            if REAL.monotonic() > end:  # the end of the answer may come late, too
-                raise NoAnswer(too_slow)
             return HttpAnswer(
                 answer.status_code,
                 answer.reason_phrase,

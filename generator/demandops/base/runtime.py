@@ -31,8 +31,6 @@ _LONGEST_REASON = 300
 
 
 class Runtime:
-    """Time, random numbers and threads of this machine; a test's subclass replaces them."""
-
     def __init__(self) -> None:
         self._failures: dict[str, tuple[str, float]] = {}
         # the error because of which the process must end, and what is called after it

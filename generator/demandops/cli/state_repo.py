@@ -20,7 +20,7 @@ from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
 from demandops.repo.git.signing import Signer
-from demandops.repo.upgrade import Upgrade, UpgradeRequest
+from demandops.repo.upgrade import Upgrade
 from demandops.serve.journal import drop as drop_demand
 from demandops.serve.journal import find_journals
 from demandops.templating.evaluator import processor_time
@@ -181,20 +181,19 @@ def upgrade(
       demandops upgrade --dry-run
       demandops upgrade --gitops argocd
     """
-    request = UpgradeRequest(gitops, url)
     asks = gitops is not None and not yes and output == "text" and sys.stdin.isatty()
     now = REAL.now()
     signer = Signer(signing_key) if signing_key and not dry_run else None
     if dry_run or asks:
         with busy("reading the ledger") as report:
-            result = upgrading.plan(state_repo, request, now, report)
+            result = upgrading.plan(state_repo, gitops, url, now, report)
     if asks and not dry_run and result.switches:
         show(output, None, [_SWITCH])
         if not click.confirm("Are those before it done?"):
             raise click.ClickException("nothing was changed; do these steps first, or give --yes")
     if not dry_run:
         with busy("reading the ledger") as report:
-            result = upgrading.upgrade(state_repo, request, now, report, signer)
+            result = upgrading.upgrade(state_repo, gitops, url, now, report, signer)
             done.extend([f"upgraded in {result.commit}"] if result.files else [])
     old, new = result.old.repo_settings, result.new.repo_settings
     outcome = "unchanged" if not result.files else "would-change" if dry_run else "upgraded"

@@ -7,6 +7,7 @@ only wake the controller. The secret that signs webhook calls is in a separate f
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -52,28 +53,31 @@ class ClusterAccess(FrozenModel):
 
     def api(self) -> Any:  # noqa: ANN401 - the library has no types
         """Return the cluster's API for objects of any kind. The access must have a kubeconfig."""
-        from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
+        from kubernetes import config  # noqa: PLC0415 - slow (half a second), so only on use
 
-        settings = client.Configuration()
-        settings.retries = False  # the library would warn of each, and the callers try again
-        config.load_kube_config(str(self.kubeconfig), self.context, settings)
-        return client.CustomObjectsApi(client.ApiClient(settings))
+        file, context = str(self.kubeconfig), self.context
+        return _api_by(lambda settings: config.load_kube_config(file, context, settings))
 
 
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
     # Of the cluster in which this process runs as a pod, whose service account has the rights.
     # ``wanted_by`` is the option or command that needs it: InvalidInput names it if this is no pod.
-    from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
+    from kubernetes import config  # noqa: PLC0415 - slow (half a second), so only on use
+
+    try:
+        return _api_by(config.load_incluster_config)
+    except config.ConfigException as error:
+        message = f"needs a pod with a service account's token: {error}"
+        raise InvalidInput.at(wanted_by, message) from None
+
+
+def _api_by(load: Callable[[Any], object]) -> Any:  # noqa: ANN401 - the library has no types
+    from kubernetes import client  # noqa: PLC0415 - slow (half a second), so only on use
 
     settings = client.Configuration()
-    # the callers retry on their own, and a renewal of a Lease has no time for more attempts
+    # the library would warn of each, and the callers try again; for a Lease there is no time
     settings.retries = False
-    try:
-        config.load_incluster_config(settings)
-    except config.ConfigException as error:
-        raise InvalidInput.at(
-            wanted_by, f"needs a pod with a service account's token: {error}"
-        ) from None
+    load(settings)
     return client.CustomObjectsApi(client.ApiClient(settings))
 
 

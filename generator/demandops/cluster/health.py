@@ -340,9 +340,7 @@ class ArgoCd(HealthReader):
         return next(iter(_applied_commits(app)), "") if app else ""
 
     def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
-        annotations = item["metadata"].get("annotations") or {}
-        tracked = f"{self.follower(domain).name}:"
-        return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
+        return _is_tracked_by(item, self.follower(domain).name)
 
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
@@ -375,9 +373,12 @@ class ArgoCd(HealthReader):
         return Health("reconciled", outdated or running, name)
 
     def _owns(self, target: Target, deployment: Object) -> bool:
-        annotations = deployment["metadata"].get("annotations") or {}
-        tracked = f"{target.domain.namespace}_{target.name}:"
-        return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
+        return _is_tracked_by(deployment, f"{target.domain.namespace}_{target.name}")
+
+
+def _is_tracked_by(item: Object, application: str) -> bool:
+    annotations = item["metadata"].get("annotations") or {}
+    return str(annotations.get(_TRACKED_BY, "")).startswith(f"{application}:")
 
 
 def _applied_commits(app: Object) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from demandops.base.quoting import one_line
@@ -110,28 +110,23 @@ class _NodeWatch:
         return self._api
 
     def _read(self) -> str:
-        if not self._version:
-            nodes, version = dict[str, ClusterNode](), ""
-            for page in self._pages():
-                nodes |= {item["metadata"]["name"]: _node(item) for item in page["items"]}
-                version = str(page["metadata"]["resourceVersion"])
-            with self._lock:
-                is_new, self._nodes = nodes != self._nodes, nodes
-            self._version, self._told = version, ""
-            if is_new:
-                self._on_change()
-        return self._version
-
-    def _pages(self) -> Iterator[dict[str, Any]]:
-        following = ""
+        if self._version:
+            return self._version
+        nodes = dict[str, ClusterNode]()
+        query = {"label_selector": self.selector, "limit": _PAGE}
         while True:
-            query = {"label_selector": self.selector, "limit": _PAGE}
-            query |= {"_continue": following} if following else {}
             answer = self._lister()(**query, _request_timeout=(CONNECT_S, WATCH_S))
-            page: dict[str, Any] = json.loads(answer.data)
-            yield page
+            page = json.loads(answer.data)
+            nodes |= {item["metadata"]["name"]: _node(item) for item in page["items"]}
             if not (following := page["metadata"].get("continue", "")):
-                return
+                break
+            query["_continue"] = following
+        with self._lock:
+            is_new, self._nodes = nodes != self._nodes, nodes
+        self._version, self._told = str(page["metadata"]["resourceVersion"]), ""
+        if is_new:
+            self._on_change()
+        return self._version
 
     def _take(self, change: str, item: dict[str, Any]) -> None:
         node = None if change == "DELETED" else _node(item)

@@ -189,9 +189,8 @@ class ReconcileTrigger:
                 wake.pushed is not None and wake.pause == _FIRST_RETRY_S
                 for wake in self._wakes.values()
             )
-            if self._ends < inf and not is_call_left:
-                return
-            if self._ends <= self._runtime.monotonic():
+            is_over = self._ends <= self._runtime.monotonic()
+            if is_over or (self._ends < inf and not is_call_left):
                 return
 
     def _note_push(self, config: Config) -> None:

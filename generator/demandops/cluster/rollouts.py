@@ -34,7 +34,13 @@ from demandops.model.config.repo_settings import RepoSettings
 from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import World
 from demandops.model.release import Release, ServiceRelease
-from demandops.render.gitops import bootstrap_path, digest_in, digest_of, domains_in_use, project_of
+from demandops.render.gitops import (
+    bootstrap_path,
+    digest_in,
+    digest_of,
+    domains_by_cluster,
+    project_of,
+)
 
 log = logging.getLogger("demandops")
 
@@ -65,8 +71,9 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
 
 
 def domains_of_state(state: State) -> list[ClusterDomain]:
-    in_use, settings = domains_in_use(state.config), state.config.repo_settings
-    return [cluster_domain(cluster, domain, settings) for cluster, domain in in_use]
+    by_cluster, settings = domains_by_cluster(state.config), state.config.repo_settings
+    pairs = ((cluster, domain) for cluster, domains in by_cluster.items() for domain in domains)
+    return [cluster_domain(cluster, domain, settings) for cluster, domain in pairs]
 
 
 def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:

@@ -227,6 +227,9 @@ class Connection:
         sender, receiver = reversed(self.nodes) if route.reverse else self.nodes
         return RouteKey(sender, route.read_topic, receiver, route.written_topic)
 
+    def keyed(self) -> Iterator[tuple[RouteKey, Route]]:
+        return ((self.key_of(route), route) for route in self.topics)
+
     def route_of(self, key: RouteKey) -> Route | None:  # the routes must be sorted
         named = filter(None, map(self.route, dict.fromkeys((key.topic, key.target))))
         return next((route for route in named if self.key_of(route) == key), None)
@@ -258,8 +261,7 @@ class Connection:
             yield ("link", self.type.name, self.target)
         if self.broker:
             yield ("broker", self.broker)
-        for route in self.topics:
-            key = self.key_of(route)
+        for key, _ in self.keyed():
             yield ("route", *key)
             yield ("brings", key.receiver, key.target)
             yield ("from", key.sender)
@@ -335,7 +337,7 @@ class Client(ABC):
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
         """Yield (file, entry, what the entry decides) for entries that affect the client."""
         # without node, access domain and images, which affect every release
-        file = config.entry_files.get(CLIENTS_FILE, {}).get(self.type.word)
+        file = config.entry_files[CLIENTS_FILE].get(self.type.word)
         if file is not None:
             yield file, self.type.word, "how its container runs"
 

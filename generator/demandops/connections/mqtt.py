@@ -52,7 +52,7 @@ class Mqtt(ConnectionType):
         if choose_broker(connection, config) is not None:
             return
         for node in _asked(connection, config):
-            if problem := config.unlisted_brokers.find(node)[1]:
+            if problem := config.broker_patterns.find(node)[1]:
                 place = config.place_of(configs.BROKERS_FILE)
                 yield fault("broker", f"{quoted(node)} {problem} ({place})", code=_NO_BROKER)
                 return
@@ -116,7 +116,7 @@ def choose_broker(connection: Connection, config: Config) -> Broker | None:
     for node in _asked(connection, config):
         if node in config.brokers:
             return config.brokers[node]
-        if config.unlisted_brokers.find(node)[1]:
+        if config.broker_patterns.find(node)[1]:
             return None  # what the patterns do not say clearly is refused, not passed over
     return None
 

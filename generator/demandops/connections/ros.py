@@ -58,10 +58,9 @@ class Ros(ConnectionType):
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None
-        sent = ((route, connection.key_of(route).sender) for route in connection.topics)
         typed = tuple(
-            replace(route, type=routes.message_type(route, sender, config))
-            for route, sender in sent
+            replace(route, type=routes.message_type(route, route_key.sender, config))
+            for route_key, route in connection.keyed()
         )
         listener = _listener(connection, config)
         if listener is None or listener.wan is None:

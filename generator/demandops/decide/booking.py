@@ -411,10 +411,9 @@ _MOST_SHOWN = 20
 
 @dataclass(frozen=True, slots=True)
 class Restoration(Rollback):
-    """A rollback with the claims of the commit ``to``, which was made at ``made``."""
+    """A rollback with the claims of the commit ``to``."""
 
     is_complete: bool = True
-    made: datetime | None = None
     claims: tuple[Claim, ...] = ()
 
 

@@ -28,8 +28,6 @@ from demandops.model.ledger.ledger import ClaimChange, Ledger, World
 
 def with_implied_routes(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDemand:
     """Return the request with each route that its applications need, on no connection yet."""
-    if not request.adds_claims:
-        return request
     brought = {
         key[2:]
         for item in request.demanded
@@ -93,7 +91,9 @@ _ORDER = attrgetter("subject.id", "demand")  # of the keys of claims
 @dataclass(slots=True)
 class _StandingRoutes:
     ledger: Ledger
-    _by_target: dict[ClaimKey, dict[tuple[str, ...], list[Route]]] = field(default_factory=dict)
+    _by_target: dict[ClaimKey, dict[tuple[str, ...], list[tuple[RouteKey, Route]]]] = field(
+        default_factory=dict
+    )
 
     def serving(self, flow: Flow, request: Demand, demand: str) -> tuple[Claim, Route] | None:
         """Return the claim and route that bring an input already, perhaps by another source name.
@@ -111,10 +111,9 @@ class _StandingRoutes:
             for claim in filter(None, map(self.ledger.get, sorted(holders, key=_ORDER))):
                 if claim.key not in self._by_target:
                     by_target = self._by_target[claim.key] = {}
-                    for route in claim.connection.topics:
-                        by_target.setdefault(claim.connection.key_of(route)[2:], []).append(route)
-                for route in self._by_target[claim.key].get(same[2:], ()):
-                    key = claim.connection.key_of(route)
+                    for keyed in claim.connection.keyed():
+                        by_target.setdefault(keyed[0][2:], []).append(keyed)
+                for key, route in self._by_target[claim.key].get(same[2:], ()):
                     was_listed = claim.demand == demand and not route.implied
                     # from another node, only an earlier goal of the demand itself brings it
                     if key.sender != same.sender and not (is_join and was_listed):
@@ -141,8 +140,6 @@ def with_carriers(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDema
     Else it is new: on the listed connection, or on a derived one, of the first type that fits. A
     connection stays as it is: another type or broker than demanded gives a note.
     """
-    if not request.adds_claims:
-        return request
     carriers = _Carriers(request, ledger, config)
     for item in request.demanded:
         listed = item.held
@@ -311,10 +308,8 @@ def brought_twice(connection: Connection, ledger: Ledger) -> Iterator[tuple[int,
         for holder in bringing if len(bringing) > len(holders) and not rivals else ():
             if holder in holders or (claim := ledger.get(holder)) is None:
                 continue
-            for route in claim.connection.topics:
-                other = claim.connection.key_of(route)
-                if other[2:] == key[2:]:
-                    rivals.append((other, holder.subject.id))
+            others = (other for other, _ in claim.connection.keyed() if other[2:] == key[2:])
+            rivals += ((other, holder.subject.id) for other in others)
         if rivals:
             rival, id = min(rivals)
             yield (
@@ -397,8 +392,7 @@ def with_moved_routes(world: World, claim: Claim, moved: Application) -> Ledger:
 def carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
     sender, _, *brought = flow.key
     for claim in ledger.claims_with("brings", *brought):
-        for route in claim.connection.topics if claim.demand == demand else ():
-            key = claim.connection.key_of(route)
+        for key, route in claim.connection.keyed() if claim.demand == demand else ():
             if [key.sender, *key[2:]] == [sender, *brought]:
                 yield claim, route
 
@@ -428,10 +422,9 @@ def without_idle_routes(
         for claim in claims:
             if claim.is_on_application:
                 continue
-            keyed = ((route, claim.connection.key_of(route)) for route in claim.connection.topics)
             idle = {
                 (route.source,)
-                for route, key in keyed
+                for key, route in claim.connection.keyed()
                 if route.implied and (key.sender, *key[2:]) not in needed
             }
             if idle:
@@ -446,8 +439,8 @@ def without_idle_routes(
 def with_one_carrier(ledger: Ledger) -> tuple[Ledger, list[ClaimKey]]:
     holders = dict[RouteKey, set[str]]()
     for claim in ledger:
-        for route in () if claim.is_on_application else claim.connection.topics:
-            holders.setdefault(claim.connection.key_of(route), set()).add(claim.subject.id)
+        for key, _ in () if claim.is_on_application else claim.connection.keyed():
+            holders.setdefault(key, set()).add(claim.subject.id)
     keys = list[ClaimKey]()
     for route_key, ids in sorted(holders.items()):
         if len(ids) < 2:

@@ -103,11 +103,7 @@ class Decision:
             domains = (domain for domain in config.domains.values() if domain.when_full == "wait")
             leases = (permission.lease_in(domain, put) for domain in domains)
             return min((lease.seconds for lease in leases if lease), default=None)
-        claims = (
-            self.state.ledger.claims_with("demand", self.request.demand)
-            if self.request.demand
-            else ()
-        )
+        claims = self.state.ledger.claims_with("demand", self.request.demand)
         claims = claims or tuple(change.after for change in self.changes.claims if change.after)
         return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
 
@@ -338,7 +334,7 @@ def _wait(
     # a demand that is sent again keeps its place among those that wait
     waiting = WaitingDemand(demand, before.since if before else now)
     reasons, who = tuple(each.message for each in faults), waiting.requesters
-    return Wait("wait", demand.id, (), demand.demand, who, waiting=waiting, reasons=reasons)
+    return Wait("wait", demand.id, (), demand.demand, who, waiting=waiting, notes=reasons)
 
 
 # ---- book and plan ----
@@ -361,7 +357,7 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
 ) -> _Booked:
     if isinstance(request, Drain):
         request = relocation.with_moves(
-            request, state, state.usage(), state.names(), placement.MOST_ATTEMPTS
+            request, state, state.usage, state.names, placement.MOST_ATTEMPTS
         )
     if isinstance(request, Restoration):
         # claims of before the upgrade may carry a route twice
@@ -404,11 +400,11 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
     # a service whose node is to be chosen later has no release yet
     affected = affected_keys(state, after, changes.claims)
     keys = [key for key in affected if isinstance(key, ClientKey) or key.node]
-    names = collisions.followed(state.names(), state, after, keys)
+    names = collisions.followed(state.names, state, after, keys)
     clashes = [
         *collisions.topic_faults(request, state, after, _paced(keys, checkpoint), names),
         *collisions.name_faults(
-            request, state, after, _paced(keys, checkpoint), changes, state.names()
+            request, state, after, _paced(keys, checkpoint), changes, state.names
         ),
     ]
     claims = filter(None, (change.after for change in changes.claims))
@@ -422,11 +418,11 @@ def _booked(  # noqa: PLR0915 - one story, from the claims to what the releases 
     if refused := [difference.fault for difference in differing if difference.is_refused]:
         raise Refused(refused)
     grown = forbidden.growth(planned.former, planned.plans, state.config)
-    refusal = forbidden.NoRoom(state.usage(), grown, state.config)
+    refusal = forbidden.NoRoom(state.usage, grown, state.config)
     # a drain was tried on its nodes already, and what releases claims makes room
     if refusal.full and (request.adds_claims or isinstance(request, Restoration)):
         raise refusal
-    after = state.followed_by(ledger, planned, state.usage().plus(grown), names)
+    after = state.followed_by(ledger, planned, state.usage.plus(grown), names)
     makes_room = any(amount < 0 for amount in grown.values())
     return _Booked(request, after, changes, planned, differing, makes_room)
 
@@ -464,8 +460,6 @@ def notes_on(
     yield from rendered.blocked
     if isinstance(request, Drain):
         yield from request.stays
-    if isinstance(request, Wait):
-        yield from request.reasons
     yield from forbidden.warnings(request, after)
 
 
@@ -500,7 +494,7 @@ def may_demand(
             why = config.why_no_node(word) if is_node else f"is not known{suggestion(word, known)}"
             raise Refused.at(field, f"{quoted(word)} {why}")
     answer = Answer(node, (fault("node", "no node is in an access domain"),), (), ())
-    for name in [node] if node else [*sorted(config.domain_of), *config.example_nodes()]:
+    for name in [node] if node else config.usable_nodes():
         held = Application(f"may/{requester}", appdef, name, version=version)
         demanded = (Item(held, (requester,)),)
         demand = Demand("put", "may", demanded, f"may/{requester}", (requester,))

@@ -158,10 +158,8 @@ def _node(id: str, source: ClusterNode, how: Discovery, problems: list[str]) -> 
             problems.append(f"node '{id}': {told} of label {quoted(key)} is left out")
         return is_usable
 
-    words, names = (
-        _keys(how.capability_labels, _CAPABILITY, labels),
-        _keys(how.property_labels, _PROPERTY, labels),
-    )
+    words = _keys(how.capability_labels, _CAPABILITY, labels)
+    names = _keys(how.property_labels, _PROPERTY, labels)
     properties = {name: _read(labels[key]) for name, key in names.items()}
     role = labels.get(how.type_label)
     capacity = dict[str, str]()
@@ -235,26 +233,18 @@ def _differences(
         field for field in {*before, *after} if before.get(field) != after.get(field)
     ):
         was, now = before.get(field), after.get(field)
-        if field == "drained":
-            told, keys = "cordoned" if now else "no longer cordoned", [""] if now else []
-        else:
-            told = f"{field} {_text(was)} → {_text(now)}"
-            keys = _labels_of(field, before, after, how)
+        told, keys = f"{field} {_text(was)} → {_text(now)}", list[str]()
+        match field:  # its keys are the labels from which it comes
+            case "drained":
+                told, keys = "cordoned" if now else "no longer cordoned", [""] if now else []
+            case "type":
+                keys = [how.type_label]
+            case "capabilities":
+                words = {*(was or ())} ^ {*(now or ())}
+                keys = [how.capability_labels.get(word, _CAPABILITY + word) for word in words]
+            case "properties":
+                had, has = was or {}, now or {}
+                names = [name for name in {*had, *has} if had.get(name) != has.get(name)]
+                keys = [how.property_labels.get(name, _PROPERTY + name) for name in names]
         writers = {source.writers[key] for key in keys if key in source.writers}
         yield " ".join([told, *(f"by {quoted(writer)}" for writer in sorted(writers))])
-
-
-def _labels_of(
-    field: str, before: Mapping[str, Any], after: Mapping[str, Any], how: Discovery
-) -> list[str]:
-    # the labels from which a changed field of the file comes
-    if field == "type":
-        return [how.type_label]
-    if field == "capabilities":
-        words = {*before.get(field, ())} ^ {*after.get(field, ())}
-        return [how.capability_labels.get(word, _CAPABILITY + word) for word in words]
-    if field == "properties":
-        was, now = before.get(field, {}), after.get(field, {})
-        names = [name for name in {*was, *now} if was.get(name) != now.get(name)]
-        return [how.property_labels.get(name, _PROPERTY + name) for name in names]
-    return []

@@ -64,14 +64,14 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
         )
         for each in malformed or allowed:
             yield each.within(claim_files.path_of(claim.key))
-        yield from collisions.faults_of_claim(claim, before, after, after.names())
+        yield from collisions.faults_of_claim(claim, before, after, after.names)
         keys, changed = keys_of_claims(after, [claim]), Changes((change,))
-        faults = list(collisions.name_faults(wanted, before, after, keys, changed, after.names()))
+        faults = list(collisions.name_faults(wanted, before, after, keys, changed, after.names))
         without = replace(after, ledger=after.ledger.replace(change.key, change.before))
         with suppress(Refused):  # other checks report a claim that cannot be planned
             grown = forbidden.growth_by(without, after, [change])
             # only growth is a fault: the nodes may be full because of other claims
-            usage = after.usage().plus({need: -amount for need, amount in grown.items()})
+            usage = after.usage.plus({need: -amount for need, amount in grown.items()})
             faults += forbidden.NoRoom(usage, grown, config).faults
         for each in faults:
             yield each.within(claim_files.path_of(claim.key))

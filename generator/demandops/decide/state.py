@@ -5,8 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
@@ -42,29 +43,29 @@ from demandops.render.gitops import path_of
 from demandops.templating.values import Evaluate
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)  # without slots, so that it can keep what it has counted
 class State(World):
     evaluate: Evaluate
-    # The releases that earlier decisions on this configuration planned, so that a decision need not
-    # plan them again to tell what it changes. A copy made with ``replace`` has none; followed_by
-    # carries over those that are still valid.
-    plans: HashTrieMap[ReleaseKey, Release] = field(
-        default_factory=HashTrieMap, init=False, compare=False, repr=False
-    )
-    _usage: Usage | None = field(default=None, init=False, compare=False, repr=False)
-    _names: Names | None = field(default=None, init=False, compare=False, repr=False)
 
+    # A copy made with ``replace`` has none of these; the methods below carry over what is valid.
+
+    @cached_property
+    def plans(self) -> HashTrieMap[ReleaseKey, Release]:
+        """The releases that earlier decisions on this configuration planned.
+
+        So a decision need not plan them again to tell what it changes.
+        """
+        return HashTrieMap()
+
+    @cached_property
     def usage(self) -> Usage:
-        """Return how much the services request; the first call counts all services."""
-        usage = forbidden.whole_usage(self) if self._usage is None else self._usage
-        object.__setattr__(self, "_usage", usage)
-        return usage
+        """How much the services request."""
+        return forbidden.whole_usage(self)
 
+    @cached_property
     def names(self) -> Names:
-        """Return the names of all releases; only the first call looks at all releases."""
-        names = collisions.all_names(self) if self._names is None else self._names
-        object.__setattr__(self, "_names", names)
-        return names
+        """The names of all releases."""
+        return collisions.all_names(self)
 
     def followed_by(
         self, ledger: Ledger, planned: PlannedChange, usage: Usage, names: Names
@@ -73,9 +74,7 @@ class State(World):
         for key, release in planned.plans.items():
             plans = plans.insert(key, release) if release else plans.discard(key)
         state = replace(self, ledger=ledger)
-        object.__setattr__(state, "plans", plans)
-        object.__setattr__(state, "_usage", usage)
-        object.__setattr__(state, "_names", names)
+        vars(state).update(plans=plans, usage=usage, names=names)
         return state
 
     def with_nodes(self, config: Config) -> State:
@@ -83,24 +82,23 @@ class State(World):
 
         Nothing that runs differs, so all that was counted of it stays valid.
         """
-        state = replace(self, config=config)
-        object.__setattr__(state, "_names", self._names)
-        if config.limits_capacity == self.config.limits_capacity:
-            object.__setattr__(state, "_usage", self._usage)
+        state, counted = replace(self, config=config), vars(self).keys() & {"usage", "names"}
+        if config.limits_capacity != self.config.limits_capacity:
+            counted.discard("usage")
+        vars(state).update({name: getattr(self, name) for name in counted})
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
         state, changes = replace(self, ledger=ledger), tuple(changes)
         # If a definition is gone, ``names`` and ``usage`` look at all releases again.
         with suppress(Refused):
-            if self._names is not None:
+            if "names" in vars(self):
                 keys = affected_keys(self, state, changes)
-                names = collisions.followed(self._names, self, state, keys)
-                object.__setattr__(state, "_names", names)
+                vars(state)["names"] = collisions.followed(self.names, self, state, keys)
         with suppress(Refused):
-            if self._usage is not None:
-                usage = self._usage.plus(forbidden.growth_by(self, state, changes))
-                object.__setattr__(state, "_usage", usage)
+            if "usage" in vars(self):
+                grown = forbidden.growth_by(self, state, changes)
+                vars(state)["usage"] = self.usage.plus(grown)
         return state
 
 
@@ -380,7 +378,7 @@ _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    if not config.domain_of and not [*config.example_nodes()]:
+    if not config.usable_nodes():
         return {}
     plain = replace(config, overrides={})
     return {name: list(_trial_services(appdef, plain)) for name, appdef in config.appdefs.items()}
@@ -390,7 +388,7 @@ def _trial_services(
     appdef: ApplicationDefinition, config: Config, version: str = ""
 ) -> Iterator[ServiceRelease]:
     services = config.services.get(appdef.name, {}).values()
-    nodes = [*sorted(config.domain_of), *config.example_nodes()]
+    nodes = config.usable_nodes()
     # A service that runs once for a cluster has no node in other clusters. So this is the first
     # node that can run all services, else the first of all.
     fitting = (node for node in nodes if all(node in s.runs_at for s in services if s.nodes))

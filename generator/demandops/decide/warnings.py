@@ -26,7 +26,7 @@ from demandops.decide.planning.flows import flows_without_carrier, topics_of_ori
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import claims_needing
 from demandops.decide.state import State, trial_releases
-from demandops.model.config.appdef import ignored_fields
+from demandops.model.config.appdef import ignored_fields, named_outputs
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.entry_patterns import may_match
@@ -70,7 +70,7 @@ def missing_inputs(state: State) -> list[MissingInput]:
         MissingInput(claim.application.id, claim_files.path_of(claim.key), reason)
         for claim in active.ledger
         if claim.is_on_application
-        for reason in _reasons(claim.application, active, state.names())
+        for reason in _reasons(claim.application, active, state.names)
     }
     return sorted(missing, key=lambda each: (each.application, each.reason, each.file))
 
@@ -90,10 +90,9 @@ def _reasons(app: Application, active: World, names: Names) -> Iterator[str]:
                 f"{flow.name} {flow.key.topic} does not arrive: no connection carries it from "
                 f"'{flow.key.sender}' to '{flow.key.receiver}'"
             )
-    services = config.services.get(app.appdef, {})
+    outputs = named_outputs(config.services.get(app.appdef, {}))
     for delivery in app.deliver:
-        name, _, output = delivery.output.partition(".")
-        if name not in services or output not in services[name].outputs:
+        if delivery.output not in outputs:
             yield (
                 f"{delivery.output} is no longer delivered to '{delivery.node}': the application "
                 f"definition '{app.appdef}' has no such output"
@@ -116,7 +115,7 @@ def unheld_outputs(held: Held, demand: str, state: State) -> Iterator[str]:
         return
     told = set[tuple[str, str]]()
     for _, input in held.all_inputs():
-        key = next(publishers(state.names(), state, input.source, input.topic), None)
+        key = next(publishers(state.names, state, input.source, input.topic), None)
         if input.application or key is None:
             continue
         claims = claims_needing(state, key)
@@ -140,14 +139,11 @@ def lost_output_notes(changes: Changes, after: State) -> Iterator[str]:
         if change.before is None or not change.before.is_on_application or change.only_renews:
             continue
         app, lost = change.before.application, dict[ClaimKey, str]()
-        services = after.config.services.get(app.appdef, {}).values()
-        for output in (
-            f"{service.name}.{name}" for service in services for name in service.outputs
-        ):
+        for output in named_outputs(after.config.services.get(app.appdef, {})):
             for made in topics_of_origin(after.config, app, output):
                 place = made.node, made.topic.topic
                 reading = [claim.key for claim in after.ledger.each_with("takes", *place)]
-                if reading and not any(publishers(after.names(), after, *place)):
+                if reading and not any(publishers(after.names, after, *place)):
                     what = f"{made.topic.topic} of '{made.node}' ({output})"
                     lost = dict.fromkeys(reading, what) | lost
         for key in sorted(lost, key=str):
@@ -434,7 +430,7 @@ def policy_warnings(world: State) -> Iterator[Fault]:
         if problem := config.unlisted.of_several_domains(id):
             message = f"{quoted(id)} {problem}, as until then it is in none"
             yield fault("", message).within(config.place_of(DOMAINS_FILE))
-    for (id, resource), used in sorted(world.usage().amounts.items()):
+    for (id, resource), used in sorted(world.usage.amounts.items()):
         node = config.nodes.get(id)
         most = node.most(resource) if node else None
         if most is not None and used > most:
@@ -446,7 +442,7 @@ def policy_warnings(world: State) -> Iterator[Fault]:
             )
             yield fault("", message).within(config.file_of(NODES_FILE, id))
     for id in world.nodes_to_drain():
-        drain = with_moves(Drain(id=id), world, world.usage(), world.names())
+        drain = with_moves(Drain(id=id), world, world.usage, world.names)
         file = config.file_of(NODES_FILE, config.host_of(id))
         for text in (*drain.moved, *drain.stays):
             yield fault("", f"'{id}' is drained: {text}").within(file)

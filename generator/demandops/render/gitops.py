@@ -50,20 +50,16 @@ def bootstrap_path(cluster: str) -> str:
     return f"{BOOTSTRAP_ROOT}/{cluster}.yaml"
 
 
-def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
-    """Return (cluster, access domain) for each domain with nodes in the cluster, sorted."""
+def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
+    """Return the access domains with nodes in each cluster, sorted."""
     pairs = {
         (cluster, domain.name)
         for node in config.kinds.values()
         for cluster, domain in config.places_of(node)
     }
-    return [(cluster, config.domains[name]) for cluster, name in sorted(pairs)]
-
-
-def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
     domains: dict[str, list[AccessDomain]] = {}
-    for cluster, domain in domains_in_use(config):
-        domains.setdefault(cluster, []).append(domain)
+    for cluster, name in sorted(pairs):
+        domains.setdefault(cluster, []).append(config.domains[name])
     return domains
 
 
@@ -384,6 +380,24 @@ def base_files(config: Config) -> dict[str, str]:
     projects = {domain.name: project_of(domain, repository) for domain in config.domains.values()}
     files: dict[str, str] = {}
     for cluster, domains in domains_by_cluster(config).items():
+        for domain in domains:
+            folder = domain_folder(cluster, domain)
+            # A placeholder, because Git keeps no empty folder. Without the folder, Flux and Argo CD
+            # would fail instead of removing what is not demanded.
+            files[f"{folder}/_domain.yaml"] = engine.text(
+                f"{gitops}/domain.yaml.j2", cluster=cluster, domain=domain
+            )
+            for name, chart in sorted(config.charts.items()) if gitops == "flux" else ():
+                for version in chart.sources():
+                    object_name = chart_object(name, version)
+                    files[f"{folder}/_charts/{object_name}.yaml"] = engine.text(
+                        "flux/chart.yaml.j2",
+                        chart=version,
+                        chart_name=name,
+                        name=object_name,
+                        namespace=domain.namespace,
+                        source=repository.source,
+                    )
         # without the URL of the repo, there is nothing that a bootstrap file could make Flux follow
         if source is None or source.url is None:
             continue
@@ -402,22 +416,4 @@ def base_files(config: Config) -> dict[str, str]:
         )
         # the file contains its own digest, which covers neither itself nor comments
         files[bootstrap_path(cluster)] = bootstrap(digest=_digest(bootstrap(digest="")))
-    for cluster, domain in domains_in_use(config):
-        # Each access domain of a cluster has a placeholder file, because Git keeps no empty folder.
-        # Without the folder, Flux and Argo CD would fail instead of removing what is not demanded.
-        folder = domain_folder(cluster, domain)
-        files[f"{folder}/_domain.yaml"] = engine.text(
-            f"{gitops}/domain.yaml.j2", cluster=cluster, domain=domain
-        )
-        for name, chart in sorted(config.charts.items()) if gitops == "flux" else ():
-            for version in chart.sources():
-                object_name = chart_object(name, version)
-                files[f"{folder}/_charts/{object_name}.yaml"] = engine.text(
-                    "flux/chart.yaml.j2",
-                    chart=version,
-                    chart_name=name,
-                    name=object_name,
-                    namespace=domain.namespace,
-                    source=repository.source,
-                )
     return files

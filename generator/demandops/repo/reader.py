@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from demandops.repo import verification
 from demandops.repo.git import repository as repositories
 from demandops.repo.git import tree as trees
 from demandops.repo.git.remote_repository import Slot, connect, is_url
-from demandops.repo.git.repository import StateRepository, access_error, reading
+from demandops.repo.git.repository import StateRepository, opening, reading
 from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
 from demandops.repo.history.commit_message import PROPOSAL
@@ -46,22 +47,19 @@ class Reader:
 
     @classmethod
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
-        try:
-            # The clone of a URL stays on the disk for later readers. It is in a folder of readers,
-            # so that none takes over a generator's journal.
-            is_cloned = is_url(address) or (not only_read and repositories.needs_push(address))
-            slot = Slot(settings.data_home(address) / "reader") if is_cloned else None
-        except OSError as error:
-            raise access_error(error, f"the data folder of {address}") from None
-        try:
-            repository = connect(address, slot.folder if slot else Path(), only_read=only_read)
-            return cls(repository, repository.refresh(), slot)
-        except BaseException as error:
+        with ExitStack() as undo:
+            with opening(f"the data folder of {address}"):
+                # The clone of a URL stays on the disk for later readers. It is in a folder of
+                # readers, so that none takes over a generator's journal.
+                is_cloned = is_url(address) or (not only_read and repositories.needs_push(address))
+                slot = Slot(settings.data_home(address) / "reader") if is_cloned else None
             if slot is not None:
-                slot.close()
-            if isinstance(error, Exception):
-                raise access_error(error, address) from None
-            raise
+                undo.callback(slot.close)
+            with opening(address):
+                repository = connect(address, slot.folder if slot else Path(), only_read=only_read)
+                reader = cls(repository, repository.refresh(), slot)
+            undo.pop_all()
+            return reader
 
     def close(self) -> None:
         if self._slot is not None:
@@ -141,8 +139,7 @@ class Reader:
         return trees.commit_of(self.objects, self.commit(revision)).tree
 
     def file_reader(self, revision: str | None = None) -> FileReader:
-        tree = self._tree(revision)
-        return lambda path: trees.read_text(tree, path)
+        return partial(trees.read_text, self._tree(revision))
 
     def config(self) -> Config:
         return snapshots.config_at(self._tree())

@@ -48,13 +48,6 @@ _NAMES = {"flux": "Flux", "argocd": "Argo CD"}
 
 
 @dataclass(frozen=True, slots=True)
-class UpgradeRequest:
-    gitops: str | None = None  # the new GitOps controller; None keeps the current one
-    # what the new controller fetches if demandops.yaml has no section for it; None: the current URL
-    url: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Upgrade:
     commit: str  # of the upgrade, or the tip if no commit was made
     old: Config
@@ -67,28 +60,28 @@ class Upgrade:
 
 
 def plan(
-    address: str,
-    request: UpgradeRequest,
-    now: datetime,
-    progress: Progress = lambda done, total: None,
+    address: str, gitops: str | None, url: str | None, now: datetime, progress: Progress
 ) -> Upgrade:
+    # ``gitops`` is the new GitOps controller; None keeps the current one. ``url`` is what a new one
+    # fetches if demandops.yaml has no section for it; None: the current URL
     with reader.opened(address) as repo:
-        return _plan(repo.repository, request, now, progress)[0]
+        return _plan(repo.repository, gitops, url, now, progress)[0]
 
 
 def upgrade(
     address: str,
-    request: UpgradeRequest,
+    gitops: str | None,
+    url: str | None,
     now: datetime,
-    progress: Progress = lambda done, total: None,
-    signer: Signer | None = None,
+    progress: Progress,
+    signer: Signer | None,
 ) -> Upgrade:
     # InvalidInput is raised if the state repo is not valid, or the request cannot be fulfilled
     with reader.opened(address) as repo:
         repository = repo.repository
         repository.signer = signer
         for attempt in range(1, _ATTEMPTS + 1):
-            planned, batch, state, keys = _plan(repository, request, now, progress)
+            planned, batch, state, keys = _plan(repository, gitops, url, now, progress)
             if not planned.files:
                 return planned
             who = commit_log.operator(repository.objects.path)
@@ -106,7 +99,11 @@ def upgrade(
 
 
 def _plan(
-    repository: StateRepository, request: UpgradeRequest, now: datetime, progress: Progress
+    repository: StateRepository,
+    gitops: str | None,
+    url: str | None,
+    now: datetime,
+    progress: Progress,
 ) -> tuple[Upgrade, CommitBatch, State, tuple[ClaimKey, ...]]:
     # the upgrade, the batch and the state to commit, and the claims that may change
     objects, tip = repository.objects, repository.tip()
@@ -117,7 +114,7 @@ def _plan(
     tree = trees.commit_of(objects, tip).tree
     files = trees.texts(tree, CONFIG_ROOTS)
     by_people = {path: without_ignored_fields(path, text) for path, text in files.items()}
-    by_people[ROOT_FILE] = _root(files[ROOT_FILE], old, request)
+    by_people[ROOT_FILE] = _root(files[ROOT_FILE], old, gitops or old.repo_settings.gitops, url)
     config = load(by_people)
     state = State(config, snapshot.state.ledger, EVALUATE)
     # people may have edited since the state in effect; their edits are checked and applied too
@@ -164,7 +161,7 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str |
     written = dict[str, str | None]()
     for path, text in files.items():
         new: str | None = text
-        if path.startswith(tuple(f"{root}/" for root in records.GONE_ROOTS)):
+        if path.startswith(records.GONE_ROOTS):
             new = None
         elif claim_files.kind_of(path) is not None:
             claim = ledger.get(claim_files.read(text, path).key)
@@ -178,9 +175,8 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str |
     return written
 
 
-def _root(text: str, config: Config, request: UpgradeRequest) -> str:
+def _root(text: str, config: Config, gitops: str, url: str | None) -> str:
     repository = config.repo_settings
-    gitops = request.gitops or repository.gitops
     try:
         if repository.render_version != RENDER_VERSION:
             text = strict_yaml.set_key(text, "renderVersion", RENDER_VERSION)
@@ -190,11 +186,11 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
         if section is None:
             # both controllers fetch the same repo, so the URL of the configured controller fits
             current = getattr(repository, repository.gitops)
-            text = strict_yaml.set_key(text, gitops, {"url": request.url or current.url})
-        elif request.url not in (None, section.url):
+            text = strict_yaml.set_key(text, gitops, {"url": url or current.url})
+        elif url not in (None, section.url):
             what = f"is set to {section.url} already; change" if section.url else "is missing; add"
             message = f"{what} it in this file, or leave out --url"
-            raise InvalidInput([fault(f"{gitops}.url", message)])
+            raise InvalidInput.at(f"{gitops}.url", message)
     except InvalidInput as error:
         raise InvalidInput(strict_yaml.faults_in(error, ROOT_FILE)) from None
     return text

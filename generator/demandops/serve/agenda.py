@@ -130,10 +130,8 @@ class Agenda:
         for end, name in _ends(state):
             seconds = (end - self._runtime.now()).total_seconds() + 0.01
             own_work = min(own_work, max(seconds, self.waits_s("end", name)))
-        own_work = min(
-            [own_work, *(self.waits_s("drain", node) for node in state.nodes_to_drain())]
-        )
-        own_work = min([own_work, *(nodes.due_in(state) for nodes in self.nodes)])
+        drains = (self.waits_s("drain", node) for node in state.nodes_to_drain())
+        own_work = min([own_work, *drains, *(nodes.due_in(state) for nodes in self.nodes)])
         first = state.ledger.first_to_end()
         if first is not self._first_to_end:  # a search is slow if many leases end at one time
             self._first_to_end, self._next_end = first, state.ledger.next_lease_end()

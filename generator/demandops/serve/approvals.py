@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from demandops.base import errors
-from demandops.base.errors import DemandOpsError, InvalidInput, Refused, fault
+from demandops.base.errors import DemandOpsError, InvalidInput, Refused
 from demandops.base.quoting import quoted
 from demandops.base.settings import PROPOSAL_LIMIT
 from demandops.decide.decision import Decision
@@ -152,7 +152,7 @@ class Approvals:
                     "approval; release some of the demands in these proposals, or ask a person to "
                     "approve or reject some of the proposals"
                 )
-                self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
+                self._demands.fail([ticket], Refused.at("", message, code="quota"))
                 return
             branch = branch_name(request.demand or request.id, ticket.operation)
             if branch in self.proposals:
@@ -325,7 +325,11 @@ class Approvals:
             if proposal.record.commits and (not booked or head in proposal.record.commits):
                 self._delete_branch(proposal.branch, heads)
             self._delete_replaced(proposal, heads)
-        if (verdict.failed or verdict.free) and self._has_moved(proposal, commits, head, heads):
+        # by this check: a person may have merged it just before, which only a later main shows
+        if (verdict.failed or verdict.free) and (head, commits) != (
+            heads.branches.get(proposal.branch, ""),
+            proposal.record.commits,
+        ):
             proposal.tickets = [ticket for ticket in tickets if ticket.state != "done"]
             proposal.searched_to = searched
             self._changed.append(proposal.branch)
@@ -336,14 +340,6 @@ class Approvals:
         if not verdict.unapproved:
             cause = next((error for _, error in verdict.failed), "it needs no approval any more")
             self._forget(proposal, "" if booked else str(cause))
-
-    @staticmethod
-    def _has_moved(
-        proposal: Proposal, commits: tuple[str, ...], head: str, heads: BranchHeads
-    ) -> bool:
-        # by this check: a person may have merged it just before, which only a later main shows
-        is_there = heads.branches.get(proposal.branch, "") == head
-        return not is_there or proposal.record.commits != commits
 
     def _receipt(
         self,
@@ -481,10 +477,10 @@ class Approvals:
         self._forge.close()
 
 
-def _belongs_to_another(branch: str) -> Refused:
+def _belongs_to_another(branch: str) -> InvalidInput:
     # a branch has the digest of an operation id in its name, and digests may collide
     message = (
         f"needs the branch {branch}, which belongs to another proposal; send the demand again with "
         "another operation id"
     )
-    return Refused([fault("", message, code="conflict")])
+    return Refused.at("", message, code="conflict")

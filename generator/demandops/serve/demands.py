@@ -318,7 +318,7 @@ class Demands:
                     refused.append((ticket, errors.QueueFull(f"{why}send the demand again later")))
                 elif operation in self._journal.pending or operation in taken:
                     why = f"'{operation}' is the operation id of another demand; choose a new one"
-                    refused.append((ticket, errors.Refused([errors.fault("", why)])))
+                    refused.append((ticket, errors.Refused.at("", why)))
                 elif self._requester_limit is not None and (
                     self._of_requester[who] >= self._requester_limit
                 ):

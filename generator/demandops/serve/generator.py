@@ -6,6 +6,7 @@ import logging
 import re
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import ExitStack
 from pathlib import Path
 
 from demandops.base import settings
@@ -15,7 +16,7 @@ from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import read_goal
 from demandops.repo.git.remote_repository import Slot, connect
-from demandops.repo.git.repository import access_error, reading
+from demandops.repo.git.repository import opening, reading
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot as snapshots
@@ -62,34 +63,27 @@ class Generator:
     ) -> None:
         heartbeat = heartbeat_in(settings.alive_file())
         signer = Signer(signing_key) if signing_key else None
-        try:
-            self._slot = Slot(data or settings.data_home(state_repo))
-        except OSError as error:
-            raise access_error(error, f"the data folder of {state_repo}") from None
-        try:
-            try:
+        with ExitStack() as undo:
+            with opening(f"the data folder of {state_repo}"):
+                self._slot = Slot(data or settings.data_home(state_repo))
+                undo.callback(self._slot.close)
                 self._journal = open_journal(self._slot.folder)
-            except OSError as error:
-                raise access_error(error, f"the data folder of {state_repo}") from None
-            repository = connect(state_repo, self._slot.folder, allow_offline=start_offline)
-            repository.signer, repository.runtime = signer, runtime
+            with opening(state_repo):
+                repository = connect(state_repo, self._slot.folder, allow_offline=start_offline)
+                repository.signer, repository.runtime = signer, runtime
 
-            def start() -> Snapshot:
-                tip = repository.tip()
-                snapshots.refuse_other_render_version(repository.objects, tip)
-                return snapshots.start_at(repository.objects, tip, progress)
+                def start() -> Snapshot:
+                    tip = repository.tip()
+                    snapshots.refuse_other_render_version(repository.objects, tip)
+                    return snapshots.start_at(repository.objects, tip, progress)
 
-            try:
-                snapshot = start()
-            except Exception:  # a power cut may have damaged the clone, which is only a copy
-                if not repository.renew_if_damaged():
-                    raise
-                snapshot = start()
-        except BaseException as error:
-            self._slot.close()
-            if isinstance(error, Exception):
-                raise access_error(error, state_repo) from None
-            raise
+                try:
+                    snapshot = start()
+                except Exception:  # a power cut may have damaged the clone, which is only a copy
+                    if not repository.renew_if_damaged():
+                        raise
+                    snapshot = start()
+            undo.pop_all()
         self._repository, self._runtime = repository, runtime
         self.address = repository.address
         self.remote_status = remote = Remote(self.address, runtime)

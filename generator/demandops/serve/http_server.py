@@ -20,6 +20,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from demandops.base.addresses import in_url
 from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
@@ -165,7 +166,7 @@ def is_local(listening: socket.socket) -> bool:
 
 def url_of(listening: socket.socket) -> str:
     host, port = listening.getsockname()[:2]
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
+    return f"http://{in_url(host)}:{port}"
 
 
 # ---- the inbound webhook: a Git server reports a push, and the generator fetches at once ----

@@ -314,12 +314,11 @@ class Worker:
             if isinstance(demand, Rollback):
                 if not self._repository.includes(str(commits.start.commit), demand.to):
                     message = f"commit {demand.to} is not in the history of the state repo; roll "
-                    raise errors.Refused([errors.fault("", f"{message}back to one that is")])
+                    raise errors.Refused.at("", f"{message}back to one that is")
                 demand = restoration(self._repository.objects, demand)
             state = commits.head.state
             # of all services, once for each configuration; that is not this demand's work
-            state.usage()
-            state.names()
+            _ = state.usage, state.names
             # what was booked must be released or restored, however long all of it takes
             with processor_time(each=DEMAND_S, together=DEMAND_S if demand.adds_claims else inf):
                 decision = decide(
@@ -401,9 +400,7 @@ class Worker:
             record = recorded[ticket.operation]
             if record.outcome == "refused":
                 message = "the demand was refused, but the reason was lost; send the demand again"
-                results.append(
-                    (ticket, errors.Refused([errors.fault("", message, code="refused")]))
-                )
+                results.append((ticket, errors.Refused.at("", message, code="refused")))
                 continue
             outcome: Outcome = "booked"
             if record.outcome != "changed":

@@ -19,7 +19,7 @@ import yaml
 from rclpy.node import Node
 
 from tests.e2e.rig import pki
-from tests.kit.http import free_port
+from tests.e2e.rig.net import free_port
 from tests.kit.limits import PATIENCE_S
 from tests.kit.rig import wait_until
 

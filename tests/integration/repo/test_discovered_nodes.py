@@ -246,13 +246,13 @@ def test_what_runs_is_not_planned_again(cluster: Cluster, bare: Path) -> None:
     cluster.add("bus0", "bus1")
     cluster.look()
     cluster.book("bus0")
-    names, usage = cluster.state.names(), cluster.state.usage()
+    names, usage = cluster.state.names, cluster.state.usage
     cluster.add("bus2", "bus0", role="tram")
     cluster.look()
     state = cluster.state
     assert state.config.nodes["bus0"].type == "tram"
-    assert state.names() is names
-    assert state.usage() is usage
+    assert state.names is names
+    assert state.usage is usage
     assert (names, usage) == (all_names(state), whole_usage(state))
     assert_sound(bare, verify_last=3)
 

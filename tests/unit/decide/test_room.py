@@ -57,12 +57,12 @@ def test_what_leaves_a_node_is_spread_over_the_others() -> None:
 
 def test_a_drain_in_parts_moves_the_same_applications_and_skips_none() -> None:
     there = on_cloud(5, 0, 3).state
-    whole = with_moves(Drain(id="cloud"), there, there.usage(), there.names())
+    whole = with_moves(Drain(id="cloud"), there, there.usage, there.names)
     assert len(whole.moved) == 3 and len(whole.stays) == 2 and not whole.last
-    parts = [with_moves(Drain(id="cloud"), there, there.usage(), there.names(), most=2)]
+    parts = [with_moves(Drain(id="cloud"), there, there.usage, there.names, most=2)]
     while after := parts[-1].last:
         drain = Drain(id="cloud", after=after)
-        parts.append(with_moves(drain, there, there.usage(), there.names(), most=2))
+        parts.append(with_moves(drain, there, there.usage, there.names, most=2))
     assert len(parts) > 1
     stays = [text.split(",")[0] for part in parts for text in part.stays]
     assert stays == [text.split(",")[0] for text in whole.stays]

@@ -184,11 +184,11 @@ def test_an_edit_by_hand_changes_what_nodes_have_left() -> None:
     repo = MemoryRepo(edited(appdef, "prefix: of", "prefix: of\n    requests: {cpu: 1}"))
     repo.take_all([put("a"), put("b")])
     known, ledger = repo.state, repo.state.ledger
-    known.usage()
+    _ = known.usage
     gone = [claim for claim in ledger if claim.is_on_application][:1]
     left = known.with_ledger(ledger.without(gone), [ClaimChange(gone[0], None)])
-    assert left.usage().amounts == replace(known, ledger=left.ledger).usage().amounts
-    assert left.usage().amounts != known.usage().amounts
+    assert left.usage.amounts == replace(known, ledger=left.ledger).usage.amounts
+    assert left.usage.amounts != known.usage.amounts
 
 
 def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:

@@ -131,21 +131,19 @@ def test_an_id_of_any_length_is_refused_as_what_it_is() -> None:
 def test_a_pattern_has_its_namespaces_and_its_part_of_the_rule_of_its_cluster() -> None:
     own_label = {"id": "bus{n}", "type": "bus", "cluster": "c-its", "selector": {"vin": "b.{n}"}}
     config = load(configuration(inventory({"id": "vehicle{n}"} | VEHICLE, own_label)))
-    ((cluster, domain),) = gitops.domains_in_use(config)
+    ((cluster, (domain,)),) = gitops.domains_by_cluster(config).items()
     rule = gitops.node_rule(cluster, domain, config)
     assert '("vin" in variables.selector && variables.selector["vin"].matches("^b\\\\.[A-Z' in rule
     tram = {"id": "tram{n}", "type": "tram", "cluster": "c-its"} | FURTHER
     config = load(configuration(inventory(tram) | two_domains()))
-    ((cluster, domain), _) = gitops.domains_in_use(config)
+    ((cluster, (domain, _)),) = gitops.domains_by_cluster(config).items()
     assert '["node_id"].matches("^tram[A-Z' in gitops.node_rule(cluster, domain, config)
 
 
 def test_a_node_of_many_patterns_is_found_among_few() -> None:
     entries = [{"id": f"fleet{i}-{{n}}", "type": "car", "cluster": "c-its"} for i in range(3000)]
     config = load(configuration(inventory(*entries)))
-    assert [*config.unlisted.patterns.candidates("fleet77-5")] == [
-        config.node_patterns["fleet77-{n}"]
-    ]
+    assert config.node_patterns.matching("fleet77-5") == [config.node_patterns["fleet77-{n}"]]
 
 
 # ---- a collection is in one file or in many, without any difference for entries and faults ----

@@ -259,8 +259,7 @@ def application(  # noqa: PLR0913 - as many as options
             raise InvalidInput.at(option, f"'{twice}' is there twice; choose another name")
     types = dict(inputs)
     # a demand can name only nodes in an access domain
-    known = (*config.domain_of, *config.example_nodes())
-    nodes = sorted(known, key=lambda id: (config.nodes[id].type != "edge", id))
+    nodes = sorted(config.usable_nodes(), key=lambda id: (config.nodes[id].type != "edge", id))
     if not (node or nodes):
         message = "the inventory has no node in an access domain, so no demand can be made"
         raise StateRepoError(f"{message}; add one first, in inventory/nodes.yaml")

@@ -382,7 +382,7 @@ def _set_drained(node: str, drained: bool, options: Options) -> None:
             # the generator moves what it placed there, in commits of its own
             plan = Drain(id=host)
             if drained:
-                plan = relocation.with_moves(plan, after, after.usage(), after.names())
+                plan = relocation.with_moves(plan, after, after.usage, after.names)
             lines = [*(f"moves: {text}" for text in plan.moved), *plan.stays]
             # what an override moved away comes back with its end
             for name, override in () if drained else sorted(after.config.overrides.items()):

@@ -15,7 +15,7 @@ from demandops.base.quoting import quoted
 from demandops.connections import connection as routes
 from demandops.connections import connection_types
 from demandops.connections.connection import UNSUPPORTED, Connection, ConnectionType
-from demandops.model.config.appdef import ApplicationDefinition, Services
+from demandops.model.config.appdef import ApplicationDefinition, Services, named_outputs
 from demandops.model.config.config import (
     CHARTS_FILE,
     DOMAINS_FILE,
@@ -117,13 +117,11 @@ def _application_faults(  # noqa: PLR0912 - a branch for each fault
 
 
 def _delivery_faults(where: str, delivery: Delivery, services: Services) -> Iterator[Fault]:
-    name, _, output = delivery.output.partition(".")
-    service = services.get(name)
-    if service is None or output not in service.outputs:
-        outputs = [f"{each.name}.{output}" for each in services.values() for output in each.outputs]
+    name, outputs = delivery.output.partition(".")[0], named_outputs(services)
+    if delivery.output not in outputs:
         close = suggestion(delivery.output, outputs)
         yield fault(f"{where}.output", f"{quoted(delivery.output)} is not an output{close}")
-    elif delivery.topic and service.roots:
+    elif delivery.topic and services[name].roots:
         message = (
             f"{name} may make several topics, so a delivery cannot rename them; leave 'topic' out"
         )
@@ -186,7 +184,7 @@ def _definition_faults(  # noqa: PLR0912 - a branch for each fault
             f"version '{version}' instead, or choose an id that does not end in '@{version}'",
         )
     if app.version and app.version not in versions:
-        listed = config.entry_files.get(VERSIONS_FILE, {}).get(appdef.name)
+        listed = config.entry_files[VERSIONS_FILE].get(appdef.name)
         where = f"{appdef.name} in {listed or config.place_of(CHARTS_FILE)}"
         message = f"{quoted(app.version)} is not a version or channel of {where}"
         if not listed:

@@ -21,19 +21,19 @@ from demandops.model.ledger.ledger import Ledger
 
 def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -> AnyDemand:
     """Return a prepared demand, whose nodes are chosen, with all else that the generator adds."""
+    if not demand.adds_claims:
+        return replace(demand, is_complete=True)
     config, ledger = state.config, state.ledger
-    if demand.adds_claims:
-        demanded = list(demand.demanded)
-        for index, item in enumerate(demanded):
-            if isinstance(app := item.held, Application):
-                # The moved services of a booked application stay on the booked nodes. Only a change
-                # of an override or of a definition moves them again, and not a further demand.
-                booked = ledger.application(app.id)
-                moved = replace(app, moved=booked.moved) if booked else app
-                if booked is None or not moved.has_same_definition_and_nodes(booked):
-                    moved = with_overridden_nodes(app, state)
-                demanded[index] = replace(item, held=moved)
-        demand = replace(demand, demanded=tuple(demanded))
+
+    def moved(app: Application) -> Application:
+        # The moved services of a booked application stay on the booked nodes. Only a change of an
+        # override or of a definition moves them again, and not a further demand.
+        booked = ledger.application(app.id)
+        stays = replace(app, moved=booked.moved) if booked else app
+        is_same = booked is not None and stays.has_same_definition_and_nodes(booked)
+        return stays if is_same else with_overridden_nodes(app, state)
+
+    demand = demand.with_each(moved)
     if flows.reads_outputs(demand):
         # again, because the nodes of listed applications may have been open
         demand, _ = flows.with_topics_of_outputs(demand, ledger, config)
@@ -43,13 +43,7 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
     # before what depends on the connection: its lease, permission, quota and approval
     demand = carriers.with_carriers(demand, ledger, config)
     checkpoint()
-    homes = [(item, config.domain_of.get(item.held.home)) for item in demand.demanded]
-    leased = (
-        replace(item, lease=permission.lease_in(home, demand) if home else None)
-        for item, home in homes
-    )
-    demand = replace(demand, demanded=tuple(leased))
-    possible = []
+    demanded = []
     for item in demand.demanded:
         # A client of the reference does not ask for the connections that it does not list, and gets
         # a warning where there can be none.
@@ -58,8 +52,10 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
             alone = replace(demand, demanded=(item,))
             if [*admission.faults(alone, config), *permission.faults(alone, config)]:
                 continue
-        possible.append(item)
-    return replace(demand, demanded=tuple(possible), is_complete=True)
+        home = config.domain_of.get(item.held.home)
+        lease = permission.lease_in(home, demand) if home else None
+        demanded.append(replace(item, lease=lease))
+    return replace(demand, demanded=tuple(demanded), is_complete=True)
 
 
 # ---- the definition that a goal of the reference's action means by a number ----
@@ -68,26 +64,23 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
 def with_definitions(demand: AnyDemand, config: Config) -> AnyDemand:
     if not demand.is_reference:
         return demand
+    by_number = {
+        f"#{wire.type}": (name, {str(listed): role for listed, role in wire.inputs.items()})
+        for name, appdef in config.appdefs.items()
+        if (wire := appdef.deployment_request)
+    }
 
-    demanded = list(demand.demanded)
-    for index, item in enumerate(demanded):
-        number = item.held.appdef.removeprefix("#") if isinstance(item.held, Application) else ""
-        if not isinstance(item.held, Application) or number == item.held.appdef:
-            continue
-        meant = (
-            (name, wire)
-            for name, appdef in config.appdefs.items()
-            if (wire := appdef.deployment_request) and str(wire.type) == number
-        )
-        if (named := next(meant, None)) is None:
-            continue
-        roles = {str(name): role for name, role in named[1].inputs.items()}
+    def defined(app: Application) -> Application:
+        if app.appdef not in by_number:
+            return app
+        name, roles = by_number[app.appdef]
         inputs: dict[str, tuple[InputTopic, ...]] = {}
-        for name, topics in item.held.inputs.items():  # both lists may be of one role
-            role = roles.get(name) or name
+        for listed, topics in app.inputs.items():  # both lists may be of one role
+            role = roles.get(listed) or listed
             inputs[role] = (*inputs.get(role, ()), *topics)
-        demanded[index] = replace(item, held=replace(item.held, appdef=named[0], inputs=inputs))
-    return replace(demand, demanded=tuple(demanded))
+        return replace(app, appdef=name, inputs=inputs)
+
+    return demand.with_each(defined)
 
 
 # ---- the choice of an access domain if a demand names a node that is in several domains ----
@@ -149,8 +142,7 @@ def _chosen(
     item: Item, booked_nodes: Mapping[str, str], config: Config, adds: bool, faults: list[Fault]
 ) -> Iterator[tuple[str, str]]:
     """Yield (field, the node's name in the chosen domain) for each node in several domains."""
-    held = item.held
-    for field, node in _named(held).items():
+    for field, node in _named(item.held).items():
         choices = config.nodes_of(node)
         if len(choices) < 2:
             continue
@@ -158,8 +150,7 @@ def _chosen(
         if booked_nodes.get(field) in choices:
             yield field, booked_nodes[field]
             continue
-        appdef = held.appdef if isinstance(held, Application) else ""
-        allowed = [choice for choice in choices if may_place(item, appdef, choice, config)]
+        allowed = [choice for choice in choices if may_place(item, choice, config)]
         if len(allowed) == 1:
             yield field, allowed[0]
         elif allowed and adds and item.requesters:
@@ -185,18 +176,17 @@ def _chosen(
 
 
 def with_separate_instances(request: AnyDemand, config: Config) -> AnyDemand:
-    return request.with_each(lambda app: _separated(app, config) if app.version else app)
+    def separated(app: Application) -> Application:
+        appdef = config.appdefs.get(app.appdef)
+        versions = config.application_versions.get(app.appdef, {})
+        version = versions.get(app.version) if app.version else None
+        if appdef is None or appdef.versions != "separate" or version is None:
+            return app
+        # the default may have several names, such as channels; they have the same rank
+        if version.rank == versions[""].rank:
+            return replace(app, version=version.name)
+        suffix = f"@{version.name}"
+        id = app.id.removesuffix(suffix) + suffix
+        return replace(app, id=id, version=version.name, separate=True)
 
-
-def _separated(app: Application, config: Config) -> Application:
-    appdef = config.appdefs.get(app.appdef)
-    versions = config.application_versions.get(app.appdef, {})
-    version = versions.get(app.version)
-    if appdef is None or appdef.versions != "separate" or version is None:
-        return app
-    # the default may have several names, such as channels; they have the same rank
-    if version.rank == versions[""].rank:
-        return replace(app, version=version.name)
-    suffix = f"@{version.name}"
-    id = app.id if app.id.endswith(suffix) else f"{app.id}{suffix}"
-    return replace(app, id=id, version=version.name, separate=True)
+    return request.with_each(separated)

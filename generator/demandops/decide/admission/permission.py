@@ -74,11 +74,11 @@ def needed_access(
         yield domain, access
 
 
-def may_place(item: Item, appdef: str, node: str, config: Config) -> bool:
-    """Return whether the requesters may use a node for an ``appdef``, or without one as an end."""
-    domain = config.domain_of.get(node)
-    access: Access = [("applications", appdef)] if appdef else []
-    access.append(("nodes", config.host_of(node)))
+def may_place(item: Item, node: str, config: Config) -> bool:
+    """Return whether the requesters may use a node for an application, or as a connection's end."""
+    domain, access = config.domain_of.get(node), [("nodes", config.host_of(node))]
+    if isinstance(item.held, Application) and item.held.appdef:
+        access.insert(0, ("applications", item.held.appdef))
     return domain is not None and not any(_not_allowed(item, domain, access))
 
 
@@ -130,10 +130,8 @@ def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
 
 def owner_faults(request: Demand, ledger: Ledger, config: Config) -> Iterator[Fault]:
     """Yield a fault if the request changes a demand of others, which no rule lets it manage."""
-    waiting, claims = (
-        ledger.waiting.get(request.demand),
-        ledger.claims_with("demand", request.demand),
-    )
+    waiting = ledger.waiting.get(request.demand)
+    claims = ledger.claims_with("demand", request.demand)
     owners = waiting.requesters if waiting else requesters_of(claims)
     homes = None if waiting else [claim.held.home for claim in claims]
     yield from stranger_faults(request, owners, homes, config)

@@ -222,26 +222,27 @@ class Choice:
         return [*self._excesses(node)]
 
     def _fitting(self) -> list[Node]:
-        required, config = self.requirement, self.config
+        required = self.requirement
         traits = (*((name,) for name in required.capabilities), *required.label_pairs)
-        # Of the nodes with each required trait, only the shortest list is searched.
-        pools = [config.nodes_with.get(trait, ()) for trait in traits]
-        pool = min((config.nodes_by_role.get(required.role, ()), *pools), key=len)
         role, wanted = required.role, {*required.capabilities}
         more = required.labels or required.properties
         return [  # there may be thousands, so what is cheap to see comes first
             node
-            for node in (*self._unlisted_home(), *pool)
+            for node in self._searched(*traits)
             if not self._closed(node)
             and (not role or node.type == role)
             and not wanted.difference(node.capabilities)
             and not (more and any(lacks(node, required)))
         ]
 
-    def _unlisted_home(self) -> list[Node]:
-        # of nodes that nobody listed, only the application's own may have one of its services
+    def _searched(self, *traits: tuple[str, ...]) -> tuple[Node, ...]:
+        # Of the nodes with the role and with each trait, the shortest list. Of those that nobody
+        # listed, only the application's own may have one of its services.
+        traits = (("", self.requirement.role), *traits)
+        listed = [self.config.nodes_with.get(trait, ()) for trait in traits]
         home = self.config.nodes.get(self.app.node) if self.service else None
-        return [home] if home and home.id not in self.config.kinds else []
+        unlisted = (home,) if home and home.id not in self.config.kinds else ()
+        return (*unlisted, *min(listed, key=len))
 
     def _rank(self) -> Callable[[Node], tuple[bool, float, float, str]]:
         positions, order = self.positions, self.config.repo_settings.placement
@@ -280,7 +281,7 @@ class Choice:
         return "" if node.id in self.config.domain_of else "is in no access domain"
 
     def _is_permitted(self, node: Node) -> bool:
-        return permission.may_place(self.item, self.app.appdef, node.id, self.config)
+        return permission.may_place(self.item, node.id, self.config)
 
     def none_fits(self) -> Fault:
         """Return the fault if no node fits: why, beginning with the nodes that nearly fit."""
@@ -290,8 +291,7 @@ class Choice:
         rank, codes = self._rank(), set[str]()
         misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
         places = {self.config.place_of(NODES_FILE): None}
-        listed = self.config.nodes_by_role.get(self.requirement.role, ())
-        for node in (*self._unlisted_home(), *listed):
+        for node in self._searched():
             missing = list(lacks(node, self.requirement))
             reasons = [f"lacks {joined(missing)}"] if missing else []
             reasons += filter(None, [self._closed(node)])

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from datetime import datetime, timezone
+from datetime import datetime
 from typing import Generic, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
@@ -34,9 +34,6 @@ from demandops.model.demand.demand import Application, Demand, Item
 from demandops.model.demand.goals import items_of
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import ClaimChange, World
-
-# The time of a claim that is judged but not booked
-_NEVER = datetime.max.replace(tzinfo=timezone.utc)
 
 _Result = TypeVar("_Result")
 
@@ -115,14 +112,15 @@ class _Places(Generic[_Result]):
         checkpoint: Callable[[], None],
     ) -> None:
         self._state, self._attempt, self._checkpoint = state, attempt, checkpoint
-        demanded = list(request.demanded)
-        for index, item in enumerate(demanded):
-            if isinstance(item.held, Application):
-                services = {service.name: "" for service in _services_to_place(item.held, state)}
-                services |= {name: item.held.services[name] for name in item.held.named}
-                demanded[index] = replace(item, held=replace(item.held, services=services))
-        self._request = replace(request, demanded=tuple(demanded))
-        self._demanded, self._faults = demanded, list[Fault]()
+
+        def opened(app: Application) -> Application:
+            services = {service.name: "" for service in _services_to_place(app, state)}
+            return replace(
+                app, services=services | {name: app.services[name] for name in app.named}
+            )
+
+        self._request = request.with_each(opened)
+        self._demanded, self._faults = [*self._request.demanded], list[Fault]()
         self._room = self._whole_room()
         self._one_by_one = False
         self._attempts = self._items = 0
@@ -135,7 +133,7 @@ class _Places(Generic[_Result]):
         own = [*ledger.claims_with("demand", request.demand), *kept]
         nodes = {node for c in own if c.is_on_application for node in c.application.needed_nodes()}
         placed = Counter(app.node for app in request.applications if app.node)
-        return Room(self._state, self._state.usage(), nodes, placed=placed)
+        return Room(self._state, self._state.usage, nodes, placed=placed)
 
     def placed(self) -> tuple[Demand, list[Fault]]:
         """Return the request with the best node for each application and service, and the faults.
@@ -313,7 +311,10 @@ def may_wait(request: Demand, state: State, checkpoint: Callable[[], None]) -> b
                 for node in choice.nodes()
                 if state.config.domain_of[node].when_full == "wait"
             )
-            claims = (Claim(held, "", request.id, item.requesters, _NEVER) for held in waiting)
+            # judged, but not booked at any time
+            claims = (
+                Claim(held, "", request.id, item.requesters, datetime.max) for held in waiting
+            )
             # A person approves only what can be booked at once, so what needs approval cannot wait.
             changes = (ClaimChange(None, claim) for claim in claims)
             if all(permission.approval(request, [each], state.config)[0] for each in changes):

@@ -172,8 +172,6 @@ def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
 
 def applications_of(ledger: Ledger, node: str) -> list[str]:
     """Return the ids of the applications on a node, or with a service placed on it, sorted."""
-    if not ledger.applications_on.get(node):
-        return []
     apps = ((id, ledger.application(id)) for id in ledger.ids_with("node", node))
     return [id for id, app in apps if app and node in app.chosen_nodes]
 

@@ -14,7 +14,7 @@ from demandops.base.errors import Fault, fault, suggestion
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.base.quoting import quoted
 from demandops.connections.connection import RouteKey
-from demandops.model.config.appdef import Service
+from demandops.model.config.appdef import Service, named_outputs
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import AnyDemand, Application, Demand, InputTopic, Item
 from demandops.model.ledger.claim import ClaimKey
@@ -234,9 +234,9 @@ def flows(config: Config, app: Application) -> list[Flow]:
                         cause = root or (next(part.topic_keys()) if service.roots else ())
                         key = RouteKey(sender, topic.topic, node, topic.topic)
                         needed.setdefault(key, Flow(origin, key, cause, type=topic.type))
+    made = named_outputs(services) if app.deliver else ()
     for index, delivery in enumerate(app.deliver):
-        producer, _, output = delivery.output.partition(".")
-        if producer not in services or output not in services[producer].outputs:
+        if delivery.output not in made:
             continue  # admission reports an unknown output
         for topic, sender, _ in topics_of_origin(config, app, delivery.output):
             target = delivery.topic or topic.topic
@@ -382,8 +382,7 @@ def _topics_of(
 ) -> list[InputTopic] | Fault:
     if isinstance(app, Fault) or app.appdef not in config.services:
         return app if isinstance(app, Fault) else [read]  # admission reports its type
-    services = config.services[app.appdef].values()
-    outputs = [f"{service.name}.{output}" for service in services for output in service.outputs]
+    outputs = named_outputs(config.services[app.appdef])
     meant = [each for each in outputs if read.output in (each, each.partition(".")[2])]
     if len(meant) != 1:
         close = suggestion(read.output, outputs) or f"; {app.appdef} has none"

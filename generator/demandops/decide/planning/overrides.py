@@ -228,10 +228,9 @@ def apply_overrides(release: Release, world: World) -> Release | None:
 
 
 def service_denied_by(release: Release, world: World) -> Override | None:
-    denies = any(override.deny for override in world.overrides)
-    if not isinstance(release, ServiceRelease) or not denies:
-        return None
-    return denied_by(_traits(release, claims_of(release, world.ledger)), world)
+    if isinstance(release, ServiceRelease) and any(each.deny for each in world.overrides):
+        return denied_by(_traits(release, claims_of(release, world.ledger)), world)
+    return None
 
 
 def apply_effects(

@@ -434,6 +434,11 @@ class Service(Deployed):
 # All services of an appdef, by name: those that it defines, and the shared ones that it uses
 Services: TypeAlias = "Mapping[str, Service]"
 
+
+def named_outputs(services: Services) -> list[str]:  # as `<service>.<output>`
+    return [f"{each.name}.{output}" for each in services.values() for output in each.outputs]
+
+
 # The path of a field of an appdef, and a message about the field
 Problem: TypeAlias = "tuple[str, str]"
 

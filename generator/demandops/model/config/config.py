@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, TypeVar
@@ -22,8 +22,6 @@ from demandops.model.config.appdef import (
 )
 from demandops.model.config.base_model import DnsLabel, faults_of, parse, parse_file
 from demandops.model.config.entry_patterns import (
-    NO_BROKER_PATTERNS,
-    NOTHING_UNLISTED,
     EntryPattern,
     EntryPatterns,
     UnlistedNodes,
@@ -91,35 +89,30 @@ class Config:
     # The text of each file below `appdefs/`, such as a template or a chart, by path
     files: Mapping[str, str]
     # For each node in a further access domain (`edge@city`), the inventory's id (`edge`)
-    hosts: Mapping[str, str] = field(default_factory=dict)
+    hosts: Mapping[str, str]
     # Since when its cluster no longer has a node that it had
-    gone_since: Mapping[str, datetime] = field(default_factory=dict)
+    gone_since: Mapping[str, datetime]
     # Every override; `demandops.model.ledger.ledger.World` knows which of them have ended
-    overrides: Mapping[str, Override] = field(default_factory=dict)
+    overrides: Mapping[str, Override]
     # The nodes and brokers whose id is a pattern
-    node_patterns: Mapping[str, EntryPattern[Node]] = field(default_factory=dict)
-    broker_patterns: Mapping[str, EntryPattern[Broker]] = field(default_factory=dict)
-    unlisted: UnlistedNodes = field(default=NOTHING_UNLISTED, compare=False, repr=False)
-    unlisted_brokers: EntryPatterns[Broker] = field(
-        default=NO_BROKER_PATTERNS, compare=False, repr=False
-    )
-    clients: ClientsFile = registry.DEFAULT_SETTINGS
-    versions: Mapping[str, registry.VersionList] = field(default_factory=dict)
+    node_patterns: EntryPatterns[Node]
+    broker_patterns: EntryPatterns[Broker]
+    unlisted: UnlistedNodes = field(compare=False, repr=False)
+    clients: ClientsFile
+    versions: Mapping[str, registry.VersionList]
     # For each collection, a map from each entry to the file that has the entry
-    entry_files: Mapping[str, Mapping[str, str]] = field(
-        default_factory=dict, compare=False, repr=False
-    )
+    entry_files: Mapping[str, Mapping[str, str]] = field(compare=False, repr=False)
     # Each listed node, and those that stand for all nodes of a pattern, by the id as it is written
     kinds: Mapping[str, Node] = field(init=False, compare=False, repr=False)
-    # For each role, the nodes with this `type`, sorted by id. The empty role has all nodes.
-    nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
-    # For each `(capability,)` or `(label key, value)`, the nodes with it, sorted by id
+    # For each `(capability,)` or `(label key, value)`, the nodes with it, sorted by id; for each
+    # `("", role)`, those of this `type`, where the empty role has all nodes
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
         init=False, compare=False, repr=False
     )
     # For each property, the type of its value on most nodes, and the first node with this type
     property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
-    drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
+    # Whether a listed node, or one of a pattern, is drained
+    has_drained: bool = field(init=False, compare=False, repr=False)
     limits_capacity: bool = field(init=False, compare=False, repr=False)
     # The input roles, sorted, that are the `root` of a service in at least one appdef
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
@@ -142,20 +135,17 @@ class Config:
             name: max(ids_by_kind.items(), key=lambda kind_and_ids: len(kind_and_ids[1]))
             for name, ids_by_kind in by_kind.items()
         }
-        by_role: dict[str, list[Node]] = {}
         by_trait: dict[tuple[str, ...], list[Node]] = {}
         for _, node in sorted(self.nodes.items()):
-            for role in ("", node.type):
-                by_role.setdefault(role, []).append(node)
-            for trait in {*((name,) for name in node.capabilities), *node.labels.items()}:
+            traits = {("", ""), ("", node.type), *((name,) for name in node.capabilities)}
+            for trait in traits | node.labels.items():
                 by_trait.setdefault(trait, []).append(node)
         services = [s for services in self.services.values() for s in services.values()]
         indexes = {
             "kinds": kinds_by_id,
-            "nodes_by_role": {role: tuple(nodes) for role, nodes in by_role.items()},
             "nodes_with": {trait: tuple(nodes) for trait, nodes in by_trait.items()},
             "property_kinds": {name: (kind, ids[0]) for name, (kind, ids) in kinds.items()},
-            "drained_nodes": tuple(sorted(id for id, node in self.nodes.items() if node.drained)),
+            "has_drained": any(node.drained for node in kinds_by_id.values()),
             "limits_capacity": any(node.capacity is not None for node in kinds_by_id.values()),
             "roles_with_services": tuple(sorted({s.root for s in services if s.root})),
             "application_versions": {name: self._versions(name) for name in self.services},
@@ -196,10 +186,10 @@ class Config:
             return "is a pattern; name one that it matches"
         return f"is not in {self.place_of(NODES_FILE)}{suggestion(id, self.kinds)}"
 
-    def example_nodes(self) -> Iterator[str]:
-        """Yield for each pattern an id of a node in an access domain, as far as it is found."""
-        for pattern in self.node_patterns.values():
-            yield from (id for id in pattern.example_ids() if id in self.domain_of)
+    def usable_nodes(self) -> list[str]:
+        """Return each listed node in an access domain, sorted, and then examples of patterns."""
+        examples = (id for pattern in self.node_patterns.values() for id in pattern.example_ids())
+        return [*sorted(self.domain_of), *(id for id in examples if id in self.domain_of)]
 
     def places_of(self, node: Node) -> list[tuple[str, AccessDomain]]:
         """Return a node's cluster and access domain, or each that nodes of a pattern may have."""
@@ -223,13 +213,13 @@ class Config:
 
     def file_of(self, collection: str, name: str) -> str:
         # for an unknown entry, the collection's usual file
-        if (file := self.entry_files.get(collection, {}).get(name)) is not None:
+        if (file := self.entry_files[collection].get(name)) is not None:
             return file
-        made_by = self.unlisted.patterns.matching(name) if collection == NODES_FILE else []
+        made_by = self.node_patterns.matching(name) if collection == NODES_FILE else []
         return made_by[0].file if made_by else collection
 
     def place_of(self, collection: str) -> str:
-        return place_of_collection(collection, self.entry_files.get(collection, {}).values())
+        return place_of_collection(collection, self.entry_files[collection].values())
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
         node, domain = self.nodes.get(id), self.domain_of.get(id)
@@ -262,7 +252,7 @@ class ConfigReader:
         for path in sorted(files):
             self.files_of[collection_of(path)].append(path)
         # The file and the path of each item, by collection and name
-        self.places: dict[str, dict[str, tuple[str, str]]] = {}
+        self.places: dict[str, dict[str, tuple[str, str]]] = {name: {} for name in COLLECTIONS}
         # The collections with items that are not valid
         self.incomplete: set[str] = set()
         # The valid entries whose id is a pattern, by collection

@@ -114,7 +114,12 @@ def read_nodes(
     for name, cluster in sorted(clusters.items()):
         if cluster.nodes == "listed":  # a file that is left over is removed by the generator
             continue
-        pattern, path = _pattern(reader, cluster), path_of(name)
+        # valid also for the first node of a role that no application knows
+        data = {"type": "node", **(cluster.discovery or Discovery()).entry}
+        data |= {"id": "{n}", "cluster": name}
+        file, place = reader.places[CLUSTERS_FILE][name]
+        pattern = EntryPattern("{n}", "id", Node, data, file, (f"{place}.discovery.entry",))
+        path = path_of(name)
         try:
             examples.append(pattern.example)  # the faults of the entry are those of its file
             reader.of_clusters.append(pattern)
@@ -137,14 +142,6 @@ def read_nodes(
                 reader.faults += error.faults
     by_people = [*(node.properties for node in (*listed.values(), *examples)), *required]
     return dict(_of_one_kind(nodes, by_people))
-
-
-def _pattern(reader: ConfigReader, cluster: Cluster) -> EntryPattern[Node]:
-    # also for the first node of a role that no application knows, whatever the cluster says of it
-    file, place = reader.places[CLUSTERS_FILE][cluster.name]
-    data = {"type": "node", **(cluster.discovery or Discovery()).entry}
-    data |= {"id": "{n}", "cluster": cluster.name}
-    return EntryPattern("{n}", "id", Node, data, file, (f"{place}.discovery.entry",))
 
 
 def _of_one_kind(

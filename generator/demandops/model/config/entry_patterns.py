@@ -125,10 +125,6 @@ class EntryPattern(Generic[Entry]):
     def where(self) -> str:
         return f"{self.file}: {field_path(self.place)}"
 
-    @property
-    def glob(self) -> str:
-        return glob_of(self.id)
-
     def example_ids(self) -> Iterator[str]:
         return (example_of(self.id, value) for value in _EXAMPLES)
 
@@ -222,7 +218,7 @@ def _read_number(
             data[last] = float(data[last]) if "." in data[last] else int(data[last])
 
 
-class EntryPatterns(Generic[Entry]):
+class EntryPatterns(dict[str, EntryPattern[Entry]]):
     """The patterns of one kind of entry; ``find`` gives an id's entry, or why it has none.
 
     ``problems`` says what other files make of an entry: fields, each with what is wrong there.
@@ -234,23 +230,15 @@ class EntryPatterns(Generic[Entry]):
         patterns: Iterable[EntryPattern[Entry]],
         problems: Callable[[Entry], Iterable[tuple[str, str]]],
     ) -> None:
-        self._word, self._patterns, self._problems = word, tuple(patterns), problems
-        self._globs = Globs((pattern.glob, pattern) for pattern in self._patterns)
+        super().__init__({pattern.id: pattern for pattern in patterns})
+        self._word, self._problems = word, problems
+        self._globs = Globs((glob_of(pattern.id), pattern) for pattern in self.values())
         self.find = lru_cache(maxsize=65_536)(self._find)
-
-    def __iter__(self) -> Iterator[EntryPattern[Entry]]:
-        return iter(self._patterns)
-
-    def __len__(self) -> int:
-        return len(self._patterns)
-
-    def candidates(self, id: str) -> Iterator[EntryPattern[Entry]]:
-        return (pattern for _, pattern in self._globs.matching(id))
 
     def matching(self, id: str) -> list[EntryPattern[Entry]]:
         if len(id) > MAX_ID:  # this is refused, but only after it was looked for
             return []
-        return [pattern for pattern in self.candidates(id) if pattern.values(id)]
+        return [pattern for _, pattern in self._globs.matching(id) if pattern.values(id)]
 
     def _find(self, id: str) -> tuple[Entry | None, str]:
         patterns = self.matching(id)
@@ -296,11 +284,11 @@ class OnDemand(dict[str, Value]):
 
 
 class Unlisted(NamedTuple):
-    """A node that a pattern gives, its access domain, and the id of the machine (``edge``)."""
+    """A node that a pattern gives, its access domain, and for ``edge@city`` its host ``edge``."""
 
     node: Node
     domain: AccessDomain | None
-    host: str
+    host: str | None
 
 
 class UnlistedNodes:
@@ -314,29 +302,29 @@ class UnlistedNodes:
     ) -> None:
         self.patterns, self._domains, self._complete = patterns, domains, complete
         self._places: dict[str, Mapping[str, list[tuple[str, AccessDomain]]]] = {}
-        self._globs = Globs((glob, name) for name, d in domains.items() for glob in d.nodes)
+        # of the access domains, each with the name of its domain
+        self.globs = Globs((glob, name) for name, d in domains.items() for glob in d.nodes)
         self.find = lru_cache(maxsize=65_536)(self._find)
 
     def _find(self, id: str) -> Unlisted | None:
         host, at, name = id.partition("@")
+        node, _ = self.patterns.find(host)
+        if node is None:
+            return None
+        first, domain = self.first_domain(host), self._domains.get(name)
         if not at:
-            node, domain, _ = self._made(id)
-            return Unlisted(self._complete(node, domain), domain, id) if node else None
+            return Unlisted(self._complete(node, first), first, None)
         # as it is written: the ROS domain of its first access domain is not that of another
-        (written, first, _), domain = self._made(host), self._domains.get(name)
-        for further in written.access_domains if written and first and domain else ():
-            if written and further.name == name:
-                return Unlisted(self._complete(written.in_domain(further), domain), domain, host)
+        for further in node.access_domains if first and domain else ():
+            if further.name == name:
+                return Unlisted(self._complete(node.in_domain(further), domain), domain, host)
         return None
-
-    def other_host(self, id: str) -> str | None:
-        # as `Config.hosts`: for `edge@city`, but not for `edge`
-        made = self.find(id)
-        return made.host if made and made.host != id else None
 
     def why_not(self, id: str) -> str:
         """Return why an id that a pattern matches is no node, or in no domain, else nothing."""
-        return self._made(id.partition("@")[0])[2]
+        host = id.partition("@")[0]
+        node, problem = self.patterns.find(host)
+        return self.of_several_domains(host) if node else problem
 
     def places(self, node: Node, clusters: Iterable[str]) -> Iterator[tuple[Node, AccessDomain]]:
         """Yield what the example of a pattern stands for, with each domain of those nodes.
@@ -358,7 +346,7 @@ class UnlistedNodes:
             ]
             there = {"cluster": filled(node.cluster, known), "access_domains": further}
             id = filled(node.id, known)
-            for name in sorted({name for _, name in self._globs.overlapping(glob_of(id))}):
+            for name in sorted({name for _, name in self.globs.overlapping(glob_of(id))}):
                 yield node.model_copy(update=there), self._domains[name]
 
     def places_by_id(
@@ -382,23 +370,13 @@ class UnlistedNodes:
         return self._places[node.id]
 
     def first_domain(self, id: str) -> AccessDomain | None:
-        names = {name for _, name in self._globs.matching(id)}
+        names = {name for _, name in self.globs.matching(id)}
         return self._domains[names.pop()] if len(names) == 1 else None
-
-    def _made(self, id: str) -> tuple[Node | None, AccessDomain | None, str]:
-        node, problem = self.patterns.find(id)
-        if node is None:
-            return None, None, problem
-        return node, self.first_domain(id), self.of_several_domains(id)
 
     def of_several_domains(self, id: str) -> str:
         """Return which access domains match an id, if these are several; then it is in none."""
-        by_name = {name: glob for glob, name in self._globs.matching(id)}
+        by_name = {name: glob for glob, name in self.globs.matching(id)}
         if len(by_name) < 2:
             return ""
         named = " and ".join(f"'{name}' by {quoted(by_name[name])}" for name in sorted(by_name))
         return f"is in the access domains {named}; narrow these patterns"
-
-
-NO_BROKER_PATTERNS = EntryPatterns[Any]("broker", (), lambda _: ())
-NOTHING_UNLISTED = UnlistedNodes(EntryPatterns("node", (), lambda _: ()), {}, lambda node, _: node)

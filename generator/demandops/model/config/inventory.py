@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+import operator
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property, lru_cache
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -32,6 +33,8 @@ from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, I
 _NAME = "[a-z][A-Za-z0-9_]*"
 _TEXT = re.compile(r"[A-Za-z0-9]([A-Za-z0-9 ._+:/-]{0,61}[A-Za-z0-9])?")
 _CONDITION = re.compile(rf"({_NAME})(>=|<=|=)(.+)")
+_COMPARED: dict[str, Callable[[Any, Any], bool]]
+_COMPARED = {"=": operator.eq, ">=": operator.ge, "<=": operator.le}
 _BOUNDS = {"min": ">=", "max": "<="}
 
 # The name of a property; it includes the unit of the value, as in `memoryGiB`
@@ -137,12 +140,7 @@ def meets_condition(properties: Mapping[str, object], text: str) -> bool:
     required = _value_as(kind, condition) if condition and kind else None
     if required is None or condition is None:
         return False
-    match condition.sign:
-        case ">=":
-            return bool(value >= required)  # type: ignore[operator]  # both are numbers
-        case "<=":
-            return bool(value <= required)  # type: ignore[operator]
-    return value == required
+    return _COMPARED[condition.sign](value, required)
 
 
 def _value_as(kind: Kind, condition: PropertyCondition) -> object:

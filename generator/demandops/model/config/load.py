@@ -28,7 +28,7 @@ from demandops.model.config.appdef import (
 from demandops.model.config.base_model import matches
 from demandops.model.config.config import Config, ConfigReader
 from demandops.model.config.cross_check import cross_check
-from demandops.model.config.entry_patterns import EntryPatterns, Globs, OnDemand, UnlistedNodes
+from demandops.model.config.entry_patterns import EntryPatterns, OnDemand, UnlistedNodes
 from demandops.model.config.inventory import Node, id_in_domain
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.model.config.policy import AccessDomain, AccessDomainsFile
@@ -96,14 +96,14 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
             place = f"{field_path(each.place)}.capacity"
             _with_short_names(written, settings, reader, each.file, place)
     for id, node in nodes.items():
+        if node.capacity is None:
+            continue
         file, place = reader.places[configs.NODES_FILE][id]
-        if node.capacity is not None and discovered.is_discovered(file):
-            # of the entry and the cluster, the cluster is the later one
+        if discovered.is_discovered(file):  # of entry and cluster, the cluster is the later one
             named = settings.with_short_names(node.capacity)
-            nodes[id] = node.model_copy(update={"capacity": named})
-        elif node.capacity is not None:
+        else:
             named = _with_short_names(node.capacity, settings, reader, file, f"{place}.capacity")
-            nodes[id] = node.model_copy(update={"capacity": named})
+        nodes[id] = node.model_copy(update={"capacity": named})
 
     def completed(node: Node, domain: AccessDomain | None) -> Node:
         node = _in_ros_domain(node, domain)
@@ -125,7 +125,8 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     node_patterns = EntryPatterns("node", reader.patterns[configs.NODES_FILE], problems)
     unlisted = UnlistedNodes(node_patterns, domains, completed)
     reader.why_not[configs.NODES_FILE] = unlisted.why_not
-    clients, client_files = registry.DEFAULT_SETTINGS, dict[str, str]()
+    clients = registry.ClientsFile(apiVersion=API_VERSION, kind="Clients")
+    client_files = dict[str, str]()
     for file in reader.files_of[configs.CLIENTS_FILE]:
         part = reader.read_file(file, registry.ClientsFile)
         words = part.model_fields_set - {"apiVersion", "kind"} if part else set()
@@ -134,9 +135,9 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
             if first != file:
                 reader.add_duplicate(word, (first, word), (file, word))
             clients = clients.model_copy(update={word: getattr(part, word)})
-    domain_of = _domains_of_nodes(reader, nodes, domains)
+    domain_of = _domains_of_nodes(reader, nodes, domains, unlisted)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
-    for pattern in node_patterns:
+    for pattern in node_patterns.values():
         node, at = pattern.example, reader.places[configs.NODES_FILE][pattern.id]
         for further in node.access_domains:
             reader.places[configs.NODES_FILE][id_in_domain(node.id, further.name)] = at
@@ -149,7 +150,7 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
     if node_patterns:
         all_nodes = OnDemand(all_nodes, lambda id: (made := unlisted.find(id)) and made.node)
         domain_of = OnDemand(domain_of, lambda id: (made := unlisted.find(id)) and made.domain)
-        hosts = OnDemand(hosts, unlisted.other_host)
+        hosts = OnDemand(hosts, lambda id: (made := unlisted.find(id)) and made.host)
     services = {
         name: _services_of(appdef, definitions, all_nodes, settings, reader)
         for name, appdef in appdefs.items()
@@ -201,10 +202,9 @@ def load(files: Mapping[str, str]) -> Config:  # noqa: PLR0912, PLR0915 - each k
         repo_settings=settings,
         clusters=clusters,
         nodes=all_nodes,
-        node_patterns={each.id: each for each in node_patterns},
-        broker_patterns={each.id: each for each in broker_patterns},
+        node_patterns=node_patterns,
+        broker_patterns=broker_patterns,
         unlisted=unlisted,
-        unlisted_brokers=broker_patterns,
         brokers=brokers,
         domains=domains,
         charts=charts,
@@ -383,13 +383,15 @@ _MOST_DOMAINS = 3
 
 
 def _domains_of_nodes(
-    reader: ConfigReader, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
+    reader: ConfigReader,
+    nodes: Mapping[str, Node],
+    domains: Mapping[str, AccessDomain],
+    unlisted: UnlistedNodes,
 ) -> Mapping[str, AccessDomain]:
     owner: dict[str, AccessDomain] = {}
-    globs = Globs((glob, name) for name, domain in domains.items() for glob in domain.nodes)
     for node in nodes:
         matching: dict[str, str] = {}
-        for pattern, name in globs.matching(node):
+        for pattern, name in unlisted.globs.matching(node):
             matching.setdefault(name, pattern)
             if len(matching) > _MOST_DOMAINS:
                 break

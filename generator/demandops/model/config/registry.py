@@ -262,6 +262,3 @@ class ClientsFile(FileModel):
     mqtt: MqttClientSettings = MqttClientSettings()
     zenoh: ClientSettings = ClientSettings()
     ros: ClientSettings = ClientSettings()
-
-
-DEFAULT_SETTINGS = ClientsFile(apiVersion="demandops/v1", kind="Clients")

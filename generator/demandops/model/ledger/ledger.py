@@ -213,9 +213,6 @@ class Ledger:
         for claims in self.claims.values():
             yield from claims
 
-    def __len__(self) -> int:
-        return sum(len(claims) for claims in self.claims.values())
-
 
 def ledger_of(claims: Iterable[Claim]) -> Ledger:
     ledger = Ledger()
@@ -310,9 +307,6 @@ class World:
 
     def nodes_to_drain(self) -> list[str]:
         """Return the drained nodes with applications or services that were placed there."""
-        config, used = self.config, self.ledger.applications_on
-        drained: Iterable[str] = config.drained_nodes
-        if any(pattern.example.drained for pattern in config.node_patterns.values()):
-            nodes = ((id, config.nodes.get(id)) for id in sorted(used))
-            drained = [id for id, node in nodes if node and node.drained]
-        return [id for id in drained if id in used]
+        used, nodes = self.ledger.applications_on, self.config.nodes
+        drained = (id for id in used if (node := nodes.get(id)) and node.drained)
+        return sorted(drained) if self.config.has_drained else []

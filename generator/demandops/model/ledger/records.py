@@ -20,7 +20,7 @@ from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.claim import LEDGER_ROOT, segment
 
 # Folders of records that earlier versions wrote: ignored, and removed by ``demandops upgrade``
-GONE_ROOTS = (f"{LEDGER_ROOT}/replicas", f"{LEDGER_ROOT}/shutdowns")
+GONE_ROOTS = (f"{LEDGER_ROOT}/replicas/", f"{LEDGER_ROOT}/shutdowns/")
 
 # ---- waiting demands, which the ledger keeps until a node has room ----
 #
@@ -46,10 +46,6 @@ class WaitingDemand:
     def requesters(self) -> tuple[str, ...]:
         return tuple(sorted(self.put.requesters()))
 
-    @property
-    def turn(self) -> tuple[int, datetime, str]:  # the lowest is tried first
-        return -self.put.priority, self.since, self.demand
-
     def __eq__(self, other: object) -> bool:
         # by the goal as it was sent
         if not isinstance(other, WaitingDemand):
@@ -66,16 +62,15 @@ WaitingDemands: TypeAlias = "HashTrieMap[str, WaitingDemand]"
 
 @dataclass(frozen=True, slots=True)
 class Wait(Demand):
-    """What a demand that must wait becomes; ``reasons`` say why."""
+    """What a demand that must wait becomes; its ``notes`` say why."""
 
     operation: Operation = "wait"
     is_complete: bool = True
     waiting: WaitingDemand | None = None
-    reasons: tuple[str, ...] = ()
 
 
-def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:
-    return sorted(waiting.values(), key=lambda demand: demand.turn)
+def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:  # the first is tried first
+    return sorted(waiting.values(), key=lambda each: (-each.put.priority, each.since, each.demand))
 
 
 def waiting_path(demand: str) -> str:

@@ -185,7 +185,6 @@ class RemoteRepository(StateRepository):
 
     always_current = on_this_disk = False
     main_reference = _REMOTE_MAIN
-    branches = "refs/remotes/origin/"
 
     def __init__(self, url: str, folder: Path, *, allow_offline: bool = False) -> None:
         self.address = without_secrets(url)
@@ -565,10 +564,9 @@ def changed_in(checkout: Path) -> list[str]:
 
 
 def is_url(address: str) -> bool:
-    try:
+    exists = False
+    with suppress(OSError):  # the address is too long, or in a folder that this user cannot read
         exists = Path(address).exists()
-    except OSError:  # the address is too long, or in a folder that this user cannot read
-        exists = False
     # like git, which takes an existing folder ``a:b`` for a folder
     return not exists and bool(_SCHEME.match(address) or _SCP.match(address))
 

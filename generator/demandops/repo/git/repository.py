@@ -154,6 +154,14 @@ def access_error(error: Exception, address: str, objects: Repository | None = No
 
 
 @contextmanager
+def opening(address: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:
+        raise access_error(error, address) from None
+
+
+@contextmanager
 def reading(address: str, objects: Repository) -> Iterator[None]:
     """Raise StateRepoError if an object is missing or damaged; see :func:`access_error`."""
     try:
@@ -205,7 +213,6 @@ class StateRepository:
     on_this_disk = True  # whether it costs nearly nothing to look for new commits
     # of the tip: main, its remote-tracking branch, or HEAD of a checkout
     main_reference = MAIN
-    branches = "refs/heads/"  # the prefix of the references of branches
     _tidying: subprocess.Popen[bytes] | None = None
     _lock_seen: tuple[tuple[int, int], float] | None = None
 
@@ -351,13 +358,7 @@ class StateRepository:
         return Repository(self.objects.path)
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or descends from it, as far as known here."""
-        if commit == other:
-            return True
-        try:
-            return self.reopened().descendant_of(commit, other)
-        except (pygit2.GitError, KeyError, ValueError):
-            return False
+        return commit == other or trees.includes(self.reopened(), commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
         pair = self._trees(commit, other)
@@ -410,7 +411,6 @@ class Checkout(StateRepository):
     """A checkout: its tip is the commit that is checked out, on any branch."""
 
     main_reference = "HEAD"
-    branches = "refs/remotes/origin/"
 
     def tip(self) -> Oid:
         target = self.objects.head.target
@@ -433,7 +433,6 @@ class LastFetch(StateRepository):
     """The clone of a URL at its last fetch, for readers that must not wait for the network."""
 
     main_reference = f"refs/remotes/origin/{MAIN_BRANCH}"
-    branches = "refs/remotes/origin/"
 
     def _require_usable(self, path: Path) -> None:
         pass  # the process that made the clone has checked it

@@ -94,6 +94,14 @@ def place_of(repo: Repository, wanted: Oid) -> str | None:
     return None
 
 
+def includes(repo: Repository, commit: str | Oid, other: str | Oid) -> bool:
+    """Return whether ``commit`` is ``other`` or descends from it, as far as known here."""
+    try:
+        return commit == other or repo.descendant_of(commit, other)
+    except (pygit2.GitError, KeyError, ValueError):
+        return False
+
+
 def parent_tree(commit: Commit) -> Tree | None:
     return commit.parents[0].tree if commit.parents else None
 
@@ -126,20 +134,13 @@ def entries(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Object]]:
     The order is Git's. A folder that is deeper than :data:`MAX_DEPTH` is yielded like a file. In a
     name, a byte that is not UTF-8 is shown as ``\\xff``.
     """
-    for root in roots:
-        child = entry(tree, root)
-        if isinstance(child, Tree):
-            yield from _entries_below(child, f"{root}/", root.count("/") + 1)
+    left = [(root, entry(tree, root)) for root in roots][::-1]
+    while left:
+        path, child = left.pop()
+        if isinstance(child, Tree) and path.count("/") < MAX_DEPTH:
+            inner = [(f"{path}/{printable(each.raw_name or b'')}", each) for each in child]
+            left += inner[::-1]
         elif child is not None:
-            yield root, child
-
-
-def _entries_below(tree: Tree, prefix: str, depth: int) -> Iterator[tuple[str, Object]]:
-    for child in tree:
-        path = prefix + printable(child.raw_name or b"")
-        if isinstance(child, Tree) and depth < MAX_DEPTH:
-            yield from _entries_below(child, f"{path}/", depth + 1)
-        else:
             yield path, child
 
 

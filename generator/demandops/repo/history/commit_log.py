@@ -249,15 +249,10 @@ class RecordedOutcome:
 
 def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, RecordedOutcome]:
     """Return the outcome of each operation that a commit after ``base`` records, newest first."""
-    if str(tip) == base:
-        return {}
-    try:
-        is_ancestor = bool(base) and repo.descendant_of(tip, base)
-    except (pygit2.GitError, KeyError, ValueError):
-        is_ancestor = False
     outcomes = {}
     # if the remote was made anew, ``base`` is unknown, and any commit may record an operation
-    for _, entry in _with_checked_signatures(repo, tip, base if is_ancestor else None):
+    known = base if base and trees.includes(repo, str(tip), base) else None
+    for _, entry in _with_checked_signatures(repo, tip, known):
         is_record = entry.by_generator or PROPOSAL in entry.trailers
         for key, outcome in _OUTCOMES.items() if is_record else ():
             waits = key == "Operation-Id" and entry.first("Operation") == "wait"

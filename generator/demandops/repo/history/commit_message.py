@@ -277,7 +277,7 @@ def _told(
         trailers = [*trailers, ("Reason", request.reason)]
         return f"{request.verb.capitalize()} {request.id}", why, trailers
     if isinstance(request, Wait):
-        who, reasons = ", ".join(request.requesters()), "; ".join(request.reasons)
+        who, reasons = ", ".join(request.requesters()), "; ".join(request.notes)
         why = f"request '{request.id}' of demand '{request.demand}' in the name of {who}, received "
         return f"Let {request.demand} wait", f"{why}{time}, waits for room: {reasons}.", []
     if not changes:

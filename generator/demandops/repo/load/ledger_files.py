@@ -103,7 +103,6 @@ def restoration(repo: Repository, rollback: Rollback) -> Restoration:
         raise InvalidInput(faults)
     return Restoration(
         to=str(commit.id),
-        made=commit_log.time_of(commit),
         claims=tuple(claims),
         drop_newer=rollback.drop_newer,
         demand=rollback.demand,

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from typing import NamedTuple
 
 from pygit2 import Commit, Oid, Repository, Tree
@@ -29,6 +30,7 @@ from demandops.decide import edits
 from demandops.decide.state import (
     Change,
     Changeset,
+    FileReader,
     ReleaseChange,
     State,
     rendered_files,
@@ -50,7 +52,7 @@ from demandops.repo.load.ledger_files import valid_claim_at
 from demandops.templating.evaluator import DEMAND_S, EVALUATE, processor_time
 
 Progress = Callable[[int, int], None]
-Files = Mapping[str, str | None]
+Files = Mapping[str, str | None]  # path → the new text; None removes the file
 # The ids of the files and folders of a configuration: equal ids, equal content.
 ConfigIds = tuple[Oid | None, ...]
 
@@ -250,8 +252,8 @@ def _was_main(repo: Repository, to: Oid, configuration: Oid) -> bool:
     if not _follows(repo, to, configuration):
         return False
     main = {to}
-    for commit, entry in commit_log.commits(repo, to, configuration):
-        if commit.id in main or (entry.by_generator and commit_log.is_by_generator(repo, commit)):
+    for commit, _ in commit_log.commits(repo, to, configuration):
+        if commit.id in main or commit_log.is_by_generator(repo, commit):
             main.update(commit.parent_ids[:1])
     found = trees.commit_of(repo, configuration)
     if configuration not in main and not commit_log.is_by_generator(repo, found):
@@ -334,8 +336,7 @@ def start_at(repo: Repository, tip: Oid, progress: Progress = lambda done, total
 def _by_generator(repo: Repository, to: Oid, after: Oid) -> Iterator[tuple[Commit, LogEntry]]:
     # newest first; without those of a fork, which a person has merged
     for commit, entry in commit_log.commits(repo, to, after):
-        is_ours = entry.by_generator and commit_log.is_by_generator(repo, commit)
-        if is_ours and _follows(repo, commit.id, after):
+        if commit_log.is_by_generator(repo, commit) and _follows(repo, commit.id, after):
             yield commit, entry
 
 
@@ -443,13 +444,13 @@ def _judged(tree: Tree, written: Tree, before: State) -> Config:
             files = {path: text for path, text in files.items() if not is_discovered(path)}
             files |= trees.texts(written, (DISCOVERED_ROOT,))
             if ROOT_FILE not in files:
-                raise InvalidInput([fault("", NO_STATE_REPO).within(ROOT_FILE)])
+                raise InvalidInput.at("", NO_STATE_REPO, file=ROOT_FILE)
             config = load_config(files)
             if config.repo_settings.render_version < in_effect:
                 message = (
                     f"is lower than {in_effect}, which `demandops upgrade` wrote; write {in_effect}"
                 )
-                raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
+                raise InvalidInput.at("renderVersion", message, file=ROOT_FILE)
             if config != before.config:  # a new one must render samples
                 # what takes too long is a fault for `check`, and of each demand that needs it;
                 # whether a configuration is valid must not depend on the machine
@@ -473,7 +474,7 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
     """
     commit, old = trees.commit_of(repo, wanted.commit), before.state
     tree, earlier = commit.tree, trees.commit_of(repo, before.commit).tree
-    read = _read_ledger(repo, before, commit)
+    read, read_text = _read_ledger(repo, before, commit), partial(trees.read_text, tree)
     state = read.state_with(old, wanted.state.config)
     renders_all = (
         state.config != old.config
@@ -495,15 +496,13 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
         touched = claim_changes(state.ledger, applied.ledger, applied.keys)
         state = state.with_ledger(applied.ledger, touched)
         subjects = tuple(dict.fromkeys((*subjects, *(edit.key.subject for edit in touched))))
-        change = edits.changeset_of_edit(
-            state, old.ledger, subjects, lambda path: trees.read_text(tree, path)
-        )
+        change = edits.changeset_of_edit(state, old.ledger, subjects, read_text)
         return state, replace(change, files={**applied.files, **change.files}), tuple(applied.keys)
 
     # claims that no demand could have booked, or that cannot be planned, are put back
     kept, refused, faults = list[ClaimChange](), list[ClaimChange](), list(read.faults)
     for change in read.changes:
-        found = _faults_of(change, old, state, tree)
+        found = _faults_of(change, old, state, read_text)
         faults += found
         (refused if found else kept).append(change)
     state = _without(state, refused)
@@ -540,13 +539,11 @@ def _carried_out(repo: Repository, before: Snapshot, wanted: Snapshot, now: date
     return Followed(snapshot, before, replace(carried, files=files), named)
 
 
-def _faults_of(change: ClaimChange, old: State, state: State, tree: Tree) -> list[Fault]:
+def _faults_of(change: ClaimChange, old: State, state: State, read: FileReader) -> list[Fault]:
     if found := list(edits.faults_of_edit(old, state, [change])):
         return found
     try:
-        edits.changeset_of_edit(
-            state, old.ledger, [change.key.subject], lambda path: trees.read_text(tree, path)
-        )
+        edits.changeset_of_edit(state, old.ledger, [change.key.subject], read)
     except InvalidInput as error:
         path = claim_files.path_of(change.key)
         return [
@@ -612,7 +609,7 @@ def problems_of(repo: Repository, snapshot: Snapshot) -> tuple[Problem, ...]:
     tree = trees.commit_of(repo, snapshot.commit).tree
     origin = commit_log.fault_origin(repo, snapshot.configuration, snapshot.commit)
     problems = []
-    faults = dict.fromkeys(with_lines(snapshot.problems, lambda path: trees.read_text(tree, path)))
+    faults = dict.fromkeys(with_lines(snapshot.problems, partial(trees.read_text, tree)))
     for number, each in enumerate(faults):
         since, author = origin(each.file) if number < _MOST_ORIGINS else ("", "")
         problems.append(

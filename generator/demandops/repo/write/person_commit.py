@@ -5,7 +5,7 @@ The person is author and committer, so a generator reads the commit like any oth
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 
@@ -25,14 +25,11 @@ from demandops.repo.git.repository import MAIN, StateRepository
 from demandops.repo.history import commit_message
 from demandops.repo.history.commit_log import Person
 from demandops.repo.load import snapshot as snapshots
-from demandops.repo.load.snapshot import Snapshot
+from demandops.repo.load.snapshot import Files, Snapshot
 from demandops.repo.write.proposal_branch import PendingProposal, ProposalBranches
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.2
-
-# Path → the new text; None removes the file.
-Files = Mapping[str, str | None]
 
 
 @dataclass(frozen=True, slots=True)

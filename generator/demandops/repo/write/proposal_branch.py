@@ -205,7 +205,7 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     # those whose commits are not on main, sorted by branch
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(*_PREFIXES)
-    space = repository.branches
+    space = _HEADS if repository.main_reference == MAIN else "refs/remotes/origin/"
     repo = Repository(repository.objects.path)
     main, folders = repository.tip(), tuple(f"{space}{prefix}" for prefix in _PREFIXES)
     for name in sorted(name for name in repo.references if name.startswith(folders)):
