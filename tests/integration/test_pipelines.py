@@ -20,6 +20,7 @@ import yaml
 from click.testing import CliRunner
 from demandops.cli.authoring.check import MARK
 
+from tests.kit import plain_yaml
 from tests.kit.cli import Ran, Run, process
 from tests.kit.config import skeleton
 from tests.kit.repo import git, program
@@ -180,24 +181,8 @@ def test_helm_is_brought_as_its_digest_says(scripts: list[str], tmp_path: Path) 
         assert (tmp_path / "helm" / "helm").exists() == brought
 
 
-GH = """
-import json, subprocess, sys
-from pathlib import Path
-here, (_, path, *options) = Path(sys.argv[0]).parent, [a for a in sys.argv[1:] if a != "--paginate"]
-if path.endswith("/zip"):
-    sys.stdout.buffer.write((here / "artifact.zip").read_bytes())
-elif options[0] == "--jq":
-    name = "artifacts.json" if "artifacts" in path else "comments.json"
-    subprocess.run(["jq", "-r", options[1], str(here / name)], check=True)
-else:
-    with (here / "written").open("a") as written:
-        print(path, *options, file=written)
-"""
-PULL_REQUESTS = """
-- {number: 1, head: {sha: newest}, base: {ref: other, repo: {id: 1}}}
-- {number: 2, head: {sha: newest}, base: {ref: main, repo: {id: 2}}}
-- {number: 3, head: {sha: newest}, base: {ref: main, repo: {id: 1}}}
-"""
+GH = Path(__file__).with_name("gh-stand-in.txt").read_text()
+PULL_REQUESTS = plain_yaml.beside(__file__, "pipelines")["pull requests"]
 ROBOT, PERSON = {"type": "Bot"}, {"type": "User"}
 REPORT = f"{MARK}\n## DemandOps: valid\n"
 CREATED = "--silent repos/its/fleet/issues/3/comments -F body=@report.md\n"
@@ -219,7 +204,7 @@ def commented(
     with zipfile.ZipFile(gh.with_name("artifact.zip"), "w") as packed:
         for name, text in entries.items():
             packed.writestr(name, text)
-    run = {"head_sha": newest, "pull_requests": yaml.safe_load(PULL_REQUESTS)}
+    run = {"head_sha": newest, "pull_requests": PULL_REQUESTS}
     for name, data in {
         "event": {"repository": {"id": 1}, "workflow_run": run},
         "artifacts": {"artifacts": [{"id": 5, "size_in_bytes": size}]},

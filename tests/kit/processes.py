@@ -75,6 +75,7 @@ class Drivers:
         lanes: list[list[dict[str, Any]]],
         *,
         dies: bool = False,
+        key: Path | None = None,
         cwd: Path | None = None,
     ) -> Run:
         """Start a generator; if it ``dies``, it does so once its first demands are journaled.
@@ -83,6 +84,7 @@ class Drivers:
         sends its next demand.
         """
         plan = {"address": str(address), "lanes": lanes, "dies": dies, "synced": self._synced}
+        plan["key"] = str(key or "")
         roots = (_CHECKOUT, _CHECKOUT / "generator", _CHECKOUT / "ros_bridge")
         run = subprocess.Popen(
             [sys.executable, "-m", "tests.kit.processes"],
@@ -128,7 +130,8 @@ def main() -> None:
     agenda.LONGEST_EVALUATION_S = 60.0  # so that no slow machine publishes a batch in two parts
     if plan["dies"]:
         die_once_journaled()
-    generator = Generator(plan["address"])
+    key = plan["key"]
+    generator = Generator(plan["address"], signing_key=Path(key) if key else None)
     tell(ready=True)
     sys.stdin.read()  # until all others are ready too
 

@@ -81,6 +81,10 @@ VIEWS = [
     ),
 ]
 SERIOUS = ("serious", "critical")
+BROKEN_WORDS, OUT_OF_ITS_CARD = (
+    Path(__file__).with_name(f"{name}.js").read_text()
+    for name in ("broken-words", "out-of-its-card")
+)
 
 
 def picture(view: str, of: str) -> Path:
@@ -114,30 +118,6 @@ def test_nothing_overflows_and_no_word_is_broken(visit: Visits, width: int) -> N
         cut = "links => links.filter(l => l.getBoundingClientRect().right > innerWidth).length"
         assert page.eval_on_selector_all("header nav a", cut) == 0, "the menu is cut"
         assert page.evaluate(BROKEN_WORDS) == [], view
-
-
-# The texts that are wider than their cells, and the words that stand in two lines, without those
-# with a hyphen or slash, where lines may end, and without long ones: the ids of releases.
-BROKEN_WORDS = r"""
-() => {
-  const broken = [];
-  for (const cell of document.querySelectorAll("td, th, h1, h2, h3, dd, .badge, .figures li")) {
-    if (cell.clientWidth && cell.scrollWidth > cell.clientWidth + 1) broken.push(cell.textContent);
-    const walker = document.createTreeWalker(cell, NodeFilter.SHOW_TEXT);
-    for (let text = walker.nextNode(); text; text = walker.nextNode()) {
-      for (const word of text.data.matchAll(/[\p{L}\p{N}_.]+/gu)) {
-        if (word[0].length > 24) continue;
-        const range = document.createRange();
-        range.setStart(text, word.index);
-        range.setEnd(text, word.index + word[0].length);
-        const lines = new Set([...range.getClientRects()].map((box) => box.top));
-        if (lines.size > 1) broken.push(word[0]);
-      }
-    }
-  }
-  return broken;
-}
-"""
 
 
 def test_an_update_of_the_page_keeps_the_focus_and_the_typed_text(
@@ -299,10 +279,3 @@ def test_long_names_scroll_no_page_sideways(visit: Visits, fleet: Story) -> None
     finally:
         book(fleet.generator, released("view", "vehicle01"))
         fleet.wait_followed()
-
-
-# The cards that a text sticks out of.
-OUT_OF_ITS_CARD = """
-() => [...document.querySelectorAll(".panel, .cause, .tile, .figures li")]
-  .filter((card) => card.scrollWidth > card.clientWidth + 1).map((card) => card.textContent)
-"""

@@ -12,7 +12,6 @@ from application_manager_interfaces.msg import Application, Connection
 from demandops.base.errors import Refused
 from demandops.model.demand.goals import read_goal
 from demandops_interfaces.action import Demand
-from demandops_interfaces.srv import GetBookkeeping
 from demandops_ros.messages import demand_goal_from_data, demand_goal_to_data, fill_message
 
 from tests.kit import forms, plain_yaml
@@ -38,12 +37,6 @@ def test_constants_and_defaults_which_have_no_hash_are_those_of_the_contract() -
     assert (Application().type, Connection().type, Connection().broker_node_id) == (0, 0, "")
     goal = DeploymentRequest.Goal()
     assert (goal.id, goal.apps, goal.connections, goal.shutdown) == ("", [], [], False)
-
-
-def test_the_bookkeeping_is_a_service() -> None:
-    assert GetBookkeeping.Request.get_fields_and_field_types() == {"at": "string"}
-    texts = dict.fromkeys(["message", "commit", "bookkeeping_json"], "string")
-    assert GetBookkeeping.Response.get_fields_and_field_types() == {"ok": "boolean", **texts}
 
 
 def test_a_message_carries_every_field_of_a_demand() -> None:

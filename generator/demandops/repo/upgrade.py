@@ -161,7 +161,7 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str |
     written = dict[str, str | None]()
     for path, text in files.items():
         new: str | None = text
-        if path.startswith(tuple(f"{root}/" for root in records.GONE_ROOTS)):
+        if path.startswith(records.GONE_ROOTS):
             new = None
         elif claim_files.kind_of(path) is not None:
             claim = ledger.get(claim_files.read(text, path).key)

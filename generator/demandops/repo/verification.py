@@ -21,8 +21,9 @@ from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
-from demandops.model.ledger.claim import OVERRIDE_PREFIX
+from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim
 from demandops.model.ledger.ledger import ClaimChange
+from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release
 from demandops.render import gitops
 from demandops.render.gitops import path_of
@@ -39,8 +40,6 @@ from demandops.repo.load.snapshot import Snapshot
 # A commit of the generator may change generated files, reports, and the claims that its message
 # names. Some operations may change further files.
 
-# An upgrade removes what earlier versions wrote below these.
-_GONE = tuple(f"{root}/" for root in records.GONE_ROOTS)
 # Operations that may rewrite a claim, to start its lease or to change its schema.
 _REWRITING = ("follow", "upgrade")
 # Operations that may add or remove the marker of an ended override.
@@ -68,7 +67,7 @@ def disallowed_files(  # noqa: PLR0912 - a branch for each kind of file
             trees.entry(commit.tree, path), Tree
         ):
             continue
-        if operation == "upgrade" and not blob and path.startswith(_GONE):
+        if operation == "upgrade" and not blob and path.startswith(records.GONE_ROOTS):
             continue
         old, new = (trees.read_text(tree, path) for tree in (before, commit.tree))
         # an upgrade takes fields out of definitions that are read no longer
@@ -110,28 +109,27 @@ def _is_as_written(text: str | None, path: str) -> bool:
 
 def _only_rewrites(commit: Commit, path: str) -> bool:
     # at most the schema of a record and the start of a claim's lease
-    if path.startswith(f"{records.WAITING_ROOT}/"):
-        texts = (trees.read_text(tree, path) for tree in (commit.parents[0].tree, commit.tree))
-        waits, still = (records.read_waiting(text or "", path) for text in texts)
-        return waits is not None and waits == still and _is_canonical(commit, path)
-    before, after = (
-        ledger_files.valid_claim_at(tree, path) for tree in (commit.parents[0].tree, commit.tree)
-    )
-    if before is None or after is None:
-        return False
-    if before.lease and after.lease and after.lease.has_started > before.lease.has_started:
-        before = replace(before, lease=replace(before.lease, until=after.lease.until))
+    before, after = (_record_at(tree, path) for tree in (commit.parents[0].tree, commit.tree))
+    if isinstance(before, Claim) and isinstance(after, Claim):
+        old, new = before.lease, after.lease
+        if old and new and new.has_started > old.has_started:
+            before = replace(before, lease=replace(old, until=new.until))
     return before == after and _is_canonical(commit, path)
 
 
 def _is_canonical(commit: Commit, path: str) -> bool:
-    text = trees.read_text(commit.tree, path) or ""
-    is_older = LEDGER_API_VERSION not in text
+    record, text = _record_at(commit.tree, path), trees.read_text(commit.tree, path) or ""
+    if record is None or LEDGER_API_VERSION not in text:  # an older one
+        return record is not None
+    if isinstance(record, Claim):
+        return text == claim_files.text_of(record)
+    return text == records.waiting_text(record)
+
+
+def _record_at(tree: Tree, path: str) -> Claim | WaitingDemand | None:
     if path.startswith(f"{records.WAITING_ROOT}/"):
-        waits = records.read_waiting(text, path)
-        return waits is not None and (is_older or records.waiting_text(waits) == text)
-    claim = ledger_files.valid_claim_at(commit.tree, path)
-    return claim is not None and (is_older or claim_files.text_of(claim) == text)
+        return records.read_waiting(trees.read_text(tree, path) or "", path)
+    return ledger_files.valid_claim_at(tree, path)
 
 
 # ---- rendering the files again, and comparing them with the committed ones ----

@@ -10,16 +10,7 @@ from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server, serving
 from tests.kit.repo import Person, program
 
-SSH = """\
-for last; do :; done
-case $last in
-  git-receive-pack*)
-    [ ! -e "$0.push" ] || sleep 1000
-    [ -z "$SAYS" ] || [ -e "$0.open" ] || { printf '%b\\n' "$SAYS" >&2; exit 1; } ;;
-  *) [ ! -e "$0.fetch" ] || sleep 1000 ;;
-esac
-exec sh -c "$last"
-"""
+SSH = Path(__file__).with_name("ssh-with-faults.sh").read_text()
 
 
 @pytest.fixture(autouse=True)

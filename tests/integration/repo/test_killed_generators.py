@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import socket
-import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,19 +16,7 @@ import pytest
 from tests.kit import rig
 from tests.kit.git_over_http import Server
 from tests.kit.repo import keygen
-from tests.kit.rig import goal, wait_until
-
-# The second line of the input lets it submit a demand; it ends only if it is killed.
-GENERATOR = """
-import json, sys, threading
-from pathlib import Path
-from demandops.serve.generator import Generator
-address, key = sys.argv[1:]
-generator = Generator(address, signing_key=Path(key) if key else None)
-print("ready", flush=True)
-generator.submit(json.loads(sys.stdin.readline()), "op-hanging")
-threading.Event().wait()
-"""
+from tests.kit.rig import Drivers, demand, goal, wait_until
 
 
 def _stat(pid: int) -> list[str]:
@@ -60,43 +46,42 @@ def command(pid: int) -> str:
 
 
 def kill_while_hanging(
-    address: str, text: str, *, key: str = "", hang: Callable[[], object] | None = None
+    drivers: Drivers,
+    address: str | Path,
+    text: str,
+    *,
+    key: Path | None = None,
+    hang: Callable[[], object] | None = None,
 ) -> None:
     """Kill a generator that waits for a process with ``text`` in its command; nothing is left.
 
     If ``hang`` is given, it is called before a demand, otherwise the start hangs.
     """
-    process = subprocess.Popen(
-        [sys.executable, "-c", GENERATOR, address, key],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )
-    assert process.stdin and process.stdout
+    run = drivers.start(address, [[demand("hanging", goal(1))]], key=key)
+    assert run.stdin and run.stdout
     try:
         if hang is not None:
-            assert process.stdout.readline() == "ready\n"
+            assert json.loads(run.stdout.readline()) == {"ready": True}
             hang()
-            process.stdin.write(json.dumps(goal(1)) + "\n")
-            process.stdin.flush()
-        wait_until(lambda: any(text in command(pid) for pid in started_by(process.pid)), text)
-        left = started_by(process.pid)
+            run.stdin.close()
+        wait_until(lambda: any(text in command(pid) for pid in started_by(run.pid)), text)
+        left = started_by(run.pid)
     finally:
-        process.kill()
-        process.communicate()
+        run.kill()
+        run.wait(rig.PATIENCE_S)
     wait_until(
         lambda: not [pid for pid, start in left.items() if _stat(pid)[19:20] == [start]],
         "what the generator had started ended",
     )
 
 
-def test_a_push_over_http_ends_with_its_generator(http: str, server: Server, bare: Path) -> None:
+def test_a_push_over_http_ends_with_its_generator(
+    drivers: Drivers, http: str, server: Server, bare: Path
+) -> None:
     silence = threading.Event()
     try:
-        kill_while_hanging(
-            http, "git-remote-http", hang=lambda: setattr(server.faults, "hang", silence)
-        )
+        hang = partial(setattr, server.faults, "hang", silence)
+        kill_while_hanging(drivers, http, "git-remote-http", hang=hang)
         server.faults.hang = None  # but the server still holds the killed push
         assert rig.restart(http) is True
         assert rig.operations(bare) == ["op-hanging"]
@@ -104,20 +89,22 @@ def test_a_push_over_http_ends_with_its_generator(http: str, server: Server, bar
         silence.set()
 
 
-def test_a_clone_or_a_push_over_ssh_ends_with_its_generator(bare: Path, ssh: Path) -> None:
+def test_a_clone_or_a_push_over_ssh_ends_with_its_generator(
+    drivers: Drivers, bare: Path, ssh: Path
+) -> None:
     address = f"ssh://host{bare}"
     push, fetch = (ssh.with_name(f"ssh.{silent}") for silent in ("push", "fetch"))
     fetch.touch()
-    kill_while_hanging(address, "sleep 1000")
+    kill_while_hanging(drivers, address, "sleep 1000")
     fetch.unlink()
-    kill_while_hanging(address, "sleep 1000", hang=push.touch)
+    kill_while_hanging(drivers, address, "sleep 1000", hang=push.touch)
     push.unlink()
     assert rig.restart(address) is True
     assert rig.operations(bare) == ["op-hanging"]
 
 
 def test_a_signature_that_an_agent_does_not_give_ends_with_its_generator(
-    bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drivers: Drivers, bare: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     key = keygen(tmp_path / "key")
     key.unlink()  # so that only an agent can sign
@@ -125,4 +112,4 @@ def test_a_signature_that_an_agent_does_not_give_ends_with_its_generator(
         agent.bind(f"{short}/agent")
         agent.listen()
         monkeypatch.setenv("SSH_AUTH_SOCK", f"{short}/agent")
-        kill_while_hanging(str(bare), "ssh-keygen", key=f"{key}.pub")
+        kill_while_hanging(drivers, bare, "ssh-keygen", key=key.with_suffix(".pub"))

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import QueueFull, StateRepoError
+from demandops.base.errors import StateRepoError
 from demandops.repo.git.remote_repository import GitResult
 from demandops.repo.git.repository import MAIN, PushDenied
 from demandops.serve import approvals
@@ -282,18 +282,3 @@ def test_stopping_does_not_wait_for_a_server_that_never_answers(
         hang.set()
     assert rig.restart(http) is True
     assert rig.operations(bare) == ["op-1"] * sends
-
-
-def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server) -> None:
-    with rig.running(http, fetch_interval=SOON_S, queue_limit=3) as generator:
-        server.faults.away = True
-        rig.wait_until(
-            lambda: generator.remote_status.unreachable, "the remote is known to be away"
-        )
-        tickets = [generator.submit(goal(number)) for number in range(500)]
-        # the worker may take demands from the queue into its batch, so the last may find room
-        rig.wait_until(lambda: any(one.future.done() for one in tickets), "a demand is refused")
-        refused = next(one for one in tickets if one.future.done())
-        with pytest.raises(QueueFull, match=r"503"):
-            rig.receipt(refused)
-        server.faults.away = False

@@ -58,20 +58,3 @@ def test_where_keys_are_listed_an_unsigned_commit_is_a_persons(
         rig.book(generator, goal(2))
         assert read(bare, DETECTION) == before
     assert made in [value.split()[0] for c in rig.commits(bare) for value in c.all("Caused-By")]
-
-
-def test_ids_of_any_sort_are_kept_by_journal_and_commits(bare: Path) -> None:
-    names = ["d" * 1024, "<a@b> (c), d", "ü" * 200, "a: b", "-rf", "#1", "🚗/🚕", "%s\\n$(x)"]
-    demands = [goals.put(name, name) for name in names]
-    with rig.running(bare) as generator:
-        rig.book(generator, *demands)
-    made = rig.commits(bare)
-    assert [(commit.one("Demand-Id"), commit.all("Requester")) for commit in made] == [
-        (name, [name]) for name in (n.replace("#1", r'"\x231"') for n in names)
-    ]
-    heads = [{key: one[key] for key in ("kind", "demand", "requesters")} for one in demands]
-    with rig.running(bare) as generator:
-        assert {claim.demand for claim in generator.snapshot.state.ledger} == {*names}
-        rig.book(generator, *(head | {"operation": "release"} for head in heads))
-    assert rig.claims(bare) == []
-    rig.assert_sound(bare, verify_last=3)

@@ -109,11 +109,23 @@ def test_every_demand_comes_once_and_in_the_order_of_its_subjects(seed: int) -> 
             assert is_free or sent.index(earlier) < sent.index(later)
 
 
-def test_too_many_demands_without_a_requester_are_told_as_such(tmp_path: Path) -> None:
-    demands = Demands(Journal(tmp_path / "journal"), 10, 1, Remote("", REAL), REAL)
+@pytest.mark.parametrize(
+    ("limit", "away", "told"),
+    [
+        (10, "", "1 demands without a requester have no answer yet; send"),
+        (1, "", "1 demands are queued already; send"),
+        (1, "503", r"1 demands are queued already and cannot be published \(503\); send"),
+    ],
+)
+def test_too_many_demands_are_told_with_the_reason(
+    tmp_path: Path, limit: int, away: str, told: str
+) -> None:
+    remote = Remote("", REAL)
+    remote.unreachable = away
+    demands = Demands(Journal(tmp_path / "journal"), limit, 1, remote, REAL)
     tickets = [Ticket(name, goals.read_goal({}), REAL.now()) for name in ("a", "b")]
     for ticket in tickets:
         demands.arrive(ticket)
     demands.take([], 0)
-    with pytest.raises(QueueFull, match=r"^1 demands without a requester have no answer yet; "):
+    with pytest.raises(QueueFull, match=f"^{told}"):
         tickets[1].future.result(0)

@@ -101,9 +101,9 @@ def _findings(checked: CheckResult) -> Iterator[str]:
     else:
         yield "## DemandOps: valid, and every release renders\n"
     yield from (f"\n{line}\n" for line in chart_lines(checked.charts, code))
-    if checked.base:
+    if base := checked.start.commit:
         invalid = "; it is not valid, so what is in effect at it was compared"
-        yield f"\nCompared with {code(checked.base[:10])}{'' if checked.base_valid else invalid}.\n"
+        yield f"\nCompared with {code(base[:10])}{'' if checked.start.valid else invalid}.\n"
     for kind, faults in (("", checked.faults), ("warning: ", checked.warnings)):
         for fault in faults:
             places = [code(place) for place in (fault.place, fault.field) if place]
@@ -196,8 +196,8 @@ def _data(checked: CheckResult) -> Json:
         "warnings": [asdict(warning) for warning in checked.warnings],
         "suggestions": [asdict(override) for override in checked.suggestions],
         "charts": charts,
-        "base": checked.base,
-        "base_valid": checked.base_valid,
+        "base": checked.start.commit or None,
+        "base_valid": checked.start.valid,
         "releases": [asdict(release) for release in merge.releases] if merge else None,
         "files": changes if merge else None,
         "pending": list(checked.pending),
@@ -291,21 +291,22 @@ def _sections(checked: CheckResult, most_lines: int) -> Iterator[_Section]:
 
 
 def _lines(checked: CheckResult) -> Iterator[str]:
+    start, base = checked.start, checked.start.commit[:10]
     consequence, sections = checked.preview, [*_sections(checked, _MOST_DIFF_LINES)]
     for section in sections[: len(checked.suggestions)]:
         yield from section.text()
-    if checked.newer:
-        commits = "a commit" if checked.newer == 1 else f"{checked.newer} commits"
+    if start.newer:
+        commits = "a commit" if start.newer == 1 else f"{start.newer} commits"
         yield (
             f"\nthe merge target has {commits} that this checkout lacks: git rebase --autostash "
-            f"{checked.target}"
+            f"{start.target}"
         )
     if consequence is None and checked.suggestions:
         yield "\nfix the errors to see what merging would do"
     if consequence and (consequence.files or checked.bookkeeping):
-        compared = f", compared with {checked.base[:10]}" if checked.base else ""
+        compared = f", compared with {base}" if base else ""
         yield f"\nwhat merging would do{compared}:"
-    if consequence and checked.base and not checked.base_valid:
-        yield f"({checked.base[:10]} is not valid, so what is in effect at it is compared)"
+    if consequence and base and not start.valid:
+        yield f"({base} is not valid, so what is in effect at it is compared)"
     for section in sections[len(checked.suggestions) :]:
         yield from section.text()

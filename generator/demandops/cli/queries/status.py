@@ -130,10 +130,8 @@ def status(
     text += map(str, (*source.old_bootstraps, *source.orphans))
     show(output, data, [*text, f"desired: {source.commit}"])
     warn_of_not_rendered(source.not_rendered)
-    for application, reason in dict.fromkeys(
-        (missing.application, missing.reason) for missing in lacking
-    ):
-        errors.print(f"warning: application '{application}': {reason}")
+    for reason in dict.fromkeys(map(str, lacking)):
+        errors.print(f"warning: {reason}")
     for name, reason in source.unreadable.items():
         errors.print(f"warning: cluster '{name}' cannot be read: {reason}")
     unwatched = ", ".join(f"'{name}'" for name in source.unwatched)

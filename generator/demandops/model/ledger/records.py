@@ -20,7 +20,7 @@ from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.claim import LEDGER_ROOT, segment
 
 # Folders of records that earlier versions wrote: ignored, and removed by ``demandops upgrade``
-GONE_ROOTS = (f"{LEDGER_ROOT}/replicas", f"{LEDGER_ROOT}/shutdowns")
+GONE_ROOTS = (f"{LEDGER_ROOT}/replicas/", f"{LEDGER_ROOT}/shutdowns/")
 
 # ---- waiting demands, which the ledger keeps until a node has room ----
 #

@@ -261,10 +261,10 @@ _SHALLOW = (
 
 @dataclass(frozen=True, slots=True)
 class Base:
-    commit: str  # empty if there is none
-    files: Mapping[str, str]
-    state: State | None  # in effect at this commit; None if there never was a valid one
-    valid: bool  # whether it is of all files of the commit
+    commit: str = ""  # empty if there is none
+    files: Mapping[str, str] = field(default_factory=dict)
+    state: State | None = None  # in effect at this commit; None if there never was a valid one
+    valid: bool = True  # whether it is of all files of the commit
     target: str = ""  # the merge target as git names it, such as ``origin/main``, if there is one
     newer: int = 0  # how many commits of the merge target the checkout lacks
     # the merge target's files, if the checkout lacks commits of it
@@ -282,7 +282,7 @@ def base_of(repo: Repository, revision: str | None, files: Mapping[str, str]) ->
             raise StateRepoError(
                 "the folder has no commit or is not a Git checkout; leave out --base"
             )
-        return Base("", files, None, True)
+        return Base(files=files)
     target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
     head = repo.head.peel(Commit)
     try:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import chain, count
 from pathlib import Path
@@ -65,16 +65,12 @@ class Suggestion:
 @dataclass(frozen=True, slots=True)
 class CheckResult:
     faults: tuple[Fault, ...]
+    start: Base = field(default_factory=Base)
     suggestions: tuple[Suggestion, ...] = ()
     # what the merge changes, without claims that are not valid; None if it cannot be rendered
     preview: MergePreview | None = None
     # also None if the base's bookkeeping is not known; empty if there is no base
     bookkeeping: tuple[EntryChange, ...] | None = None
-    base: str | None = None  # the commit that the checkout is compared with
-    base_valid: bool = True  # if not, what is in effect at it is compared
-    # the name of the merge target, and how many commits it has that the checkout lacks
-    target: str = ""
-    newer: int = 0
     # the files of the preview that a generator would write without the edit too
     pending: tuple[str, ...] = ()
     warnings: tuple[Fault, ...] = ()  # likely mistakes, and what a person has to do after the merge
@@ -103,13 +99,7 @@ def check(
     edit = _Edit(files, start, now or REAL.now())
     claims, faults = ledger_files.read_claims(sorted(files.items()))
     edited = [path for path in edit.changed if _is_written_by_generator(path)]
-    result = CheckResult(
-        (),
-        base=start.commit or None,
-        base_valid=start.valid,
-        target=start.target,
-        newer=start.newer,
-    )
+    result = CheckResult((), start)
     try:
         config = edit.config()
         faults += edit.unversioned_charts(config)
