@@ -37,25 +37,24 @@ def test_a_fault_of_the_program_or_its_machine_has_a_code_of_its_own(
     assert ran.err.startswith(told)
 
 
-class TestProcess:
-    def run(self, *args: str, **environment: str) -> Ran:
-        return process(*PROGRAM, *args, env=os.environ | environment)
+def in_process(*args: str, **environment: str) -> Ran:
+    return process(*PROGRAM, *args, env=os.environ | environment)
 
-    def test_in_a_hook_it_works_on_the_state_repo_and_not_on_the_hooks_repo(
-        self, bare: Path, tmp_path: Path
-    ) -> None:
-        git(tmp_path, "init", "--quiet", "other")
-        config = tmp_path / "other" / ".git" / "config"
-        before = config.read_text()
-        of_hook = {"GIT_INDEX_FILE": "index", "GIT_QUARANTINE_PATH": "x"}
-        where = ("--state-repo", bare.as_uri())
-        ran = self.run("get", "nodes", *where, GIT_DIR=str(config.parent), **of_hook)
-        assert (ran.code, ran.out[:4]) == (0, "NODE"), ran.err
-        assert config.read_text() == before
 
-    def test_a_machine_without_git_is_told_what_to_install(
-        self, bare: Path, tmp_path: Path
-    ) -> None:
-        ran = self.run("get", "nodes", "--state-repo", str(bare), PATH=str(tmp_path))
-        assert ran.code == 1
-        assert ran.err.startswith("error: get needs git, which is not installed; install it")
+def test_in_a_hook_it_works_on_the_state_repo_and_not_on_the_hooks_repo(
+    bare: Path, tmp_path: Path
+) -> None:
+    git(tmp_path, "init", "--quiet", "other")
+    config = tmp_path / "other" / ".git" / "config"
+    before = config.read_text()
+    of_hook = {"GIT_INDEX_FILE": "index", "GIT_QUARANTINE_PATH": "x"}
+    where = ("--state-repo", bare.as_uri())
+    ran = in_process("get", "nodes", *where, GIT_DIR=str(config.parent), **of_hook)
+    assert (ran.code, ran.out[:4]) == (0, "NODE"), ran.err
+    assert config.read_text() == before
+
+
+def test_a_machine_without_git_is_told_what_to_install(bare: Path, tmp_path: Path) -> None:
+    ran = in_process("get", "nodes", "--state-repo", str(bare), PATH=str(tmp_path))
+    assert ran.code == 1
+    assert ran.err.startswith("error: get needs git, which is not installed; install it")

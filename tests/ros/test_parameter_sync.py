@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_msgs.msg import String
 
+from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.cluster import KubeApi, kube_api
 from tests.kit.http import kubeconfig
@@ -232,16 +233,7 @@ def test_parameters_have_dotted_names_and_a_file_that_gives_a_node_nothing_is_re
     text = "/f/*: {ros__parameters: {a: 2}}\n/**/n: {ros__parameters: {a: 1}}\n/*: 5\nf/m: 5\n"
     assert parameters_of("f/n", text, "f") == {"a": 2}
     assert Parameter("b.c", value=["x"]).type_ is Parameter.Type.STRING_ARRAY
-    for text, told in (
-        ("- 1", "must map nodes to their parameters"),
-        ("other: {}", "node: has no parameters of the node; write node: {ros__parameters: …}"),
-        ("node: {}", "node.ros__parameters: must be a mapping"),
-        (
-            "node: {ros__parameters: {a.b: 1, a: {b: 2}}}",
-            "node.ros__parameters.a.b: the parameter 'a.b' is here twice, because dots nest; "
-            "remove one",
-        ),
-    ):
+    for text, told in plain_yaml.beside(__file__, "refused")["parameter files"]:
         with pytest.raises(InvalidInput) as refused:
             parameters_of("/node", text, "f")
         assert str(refused.value) == f"f: {told}"

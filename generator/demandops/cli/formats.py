@@ -45,14 +45,9 @@ class _Format(click.Choice[str]):
 
 def output_formats(*formats: str) -> Callable[[Command], Command]:
     # with ``--output json``, a command that raises DemandOpsError also prints the faults as JSON
-    option = click.option(
-        "-o",
-        "--output",
-        type=_Format(formats),
-        default="text",
-        show_default=True,
-        help="The output format.",
-    )
+    names, form = ("-o", "--output"), _Format(formats)
+    help = "The output format."
+    option = click.option(*names, type=form, default="text", show_default=True, help=help)
 
     def add(command: Command) -> Command:
         @wraps(command)
@@ -224,22 +219,11 @@ class Table:
                 room -= more
         lines = [paint(line, "bold") for line in _laid_out(heads, shown, widths)]
         for row in rows:
-            lines += _laid_out(
-                row, shown, widths, lambda text: paint(text, self.styles.get(text, ""))
-            )
+            lines += _laid_out(row, shown, widths, lambda t: paint(t, self.styles.get(t, "")))
         if left_out := [heads[at] for at in used if at not in shown]:
             note = f"more columns {self.how_to_see}: {', '.join(left_out)}"
             lines += [paint(line, "dim") for line in _wrapped(note, width)]
         return [*title, *lines]
-
-
-def table_of(
-    columns: Sequence[Column],
-    items: Iterable[Json],
-    now: datetime,
-    **more: Any,  # noqa: ANN401 - the other fields of a table
-) -> Table:
-    return Table(columns, [[each.texts(item, now) for each in columns] for item in items], **more)
 
 
 def _wrapped(text: str, width: int) -> list[str]:
@@ -284,16 +268,9 @@ def list_table(
     # ``wide`` is None for a command without ``-o wide``
     columns = [column for column in kind.columns if wide or not column.only_wide]
     cells = [[column.texts(row.item, now) for column in columns] for row in rows]
-    if not wide:  # of long lists the beginning, so that most rows have one line
-        cells = [
-            [
-                texts
-                if len(texts) <= _MOST
-                else [*texts[: _MOST - 1], f"+{len(texts) - _MOST + 1}"]
-                for texts in row
-            ]
-            for row in cells
-        ]
+    for cell in (cell for row in cells if not wide for cell in row):
+        if len(cell) > _MOST:  # the beginning of long lists, so that most rows have one line
+            cell[_MOST - 1 :] = [f"+{len(cell) - _MOST + 1}"]
     for column in kind.columns if wide else ():
         if column.form == "time":  # and when that was by the clock
             columns.append(Column(column.key, f"{column.title} (UTC)"))
@@ -302,5 +279,4 @@ def list_table(
                 clock = since and f"{since.astimezone(timezone.utc):%Y-%m-%d %H:%M:%S}"
                 texts.append([clock] if clock else [])
     how_to_see = "in a wider terminal" if wide is None else "with -o wide"
-    more: dict[str, Any] = {"whole": bool(wide), "how_to_see": how_to_see}
-    return Table(columns, cells, empty=f"no {kind.name}", styles=STYLES, **more)
+    return Table(columns, cells, "", f"no {kind.name}", STYLES, bool(wide), how_to_see)

@@ -185,18 +185,14 @@ class _LazyGroup(click.Group):
         meant = next((lead for lead, words in _LEADS.items() if told & {*words.split(", ")}), "")
         if meant or is_unknown:
             kinds = import_module("demandops.views.kinds").KINDS
-            meant = meant or next(
-                (f"get {name}" for name in kinds if word in (name, name[:-1])), ""
-            )
+            fitting = (f"get {name}" for name in kinds if word in (name, name[:-1]))
+            meant = meant or next(fitting, "")
             hint = suggestion(word, [*COMMANDS, *ALIASES]).replace("known:", "the commands are:")
             hint = f"; did you mean: demandops {meant}" if meant else hint
             ctx.fail(f"there is no command '{word if is_unknown else both}'{hint}")
+        # `kubectl describe` names the kind first
         if word == "why" and len(args) > 2 and not any(arg.startswith("-") for arg in args[1:3]):
-            args[1:3] = [
-                args[2],
-                "--kind",
-                args[1].lower().removesuffix("s"),
-            ]  # as `kubectl describe` names things
+            args[1:3] = [args[2], "--kind", args[1].lower().removesuffix("s")]
         name, command, arguments = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
             child_processes.listeners[:] = [show_slow]
@@ -287,11 +283,10 @@ def _run(args: list[str]) -> int:
         errors.print(f"error: the output cannot be written: {error}{told}")
         return ExitCode.USER_ERROR
     except OSError as error:  # of a file, a folder or the machine's limits
-        place = (
-            f"{os.fsdecode(error.filename)}: " if isinstance(error.filename, str | bytes) else ""
-        )
-        reason = error.strerror or str(error)
-        errors.print(f"error: {place}{reason}; {_REMEDIES.get(error.errno or 0, _REMEDY)}")
+        is_named = isinstance(error.filename, str | bytes)
+        place = f"{os.fsdecode(error.filename)}: " if is_named else ""
+        remedy = _REMEDIES.get(error.errno or 0, _REMEDY)
+        errors.print(f"error: {place}{error.strerror or error}; {remedy}")
         logging.getLogger("demandops").info("traceback", exc_info=True)
         return ExitCode.USER_ERROR
     except Exception as error:

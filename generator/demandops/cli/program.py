@@ -14,7 +14,7 @@ from demandops import __version__
 from demandops.base import settings
 from demandops.base.runtime import REAL
 from demandops.cli import target
-from demandops.cli.formats import output_option, show, table_of
+from demandops.cli.formats import Table, output_option, show
 from demandops.cli.output import print_lines
 from demandops.cli.target import context_names
 from demandops.model.config.base_model import parse
@@ -47,11 +47,8 @@ def version(output: str) -> None:
         "python": platform.python_version(),
         "git": git,
     }
-    names = {"version": "demandops"}
-    lines = [
-        f"{names.get(name, name.replace('_', ' ')):18} {value}" for name, value in data.items()
-    ]
-    show(output, data, lines)
+    words = {name: "demandops" if name == "version" else name.replace("_", " ") for name in data}
+    show(output, data, [f"{words[name]:18} {value}" for name, value in data.items()])
 
 
 # ---- ``demandops completion`` ----
@@ -110,20 +107,15 @@ def list_contexts(output: str) -> None:
       demandops config list
     """
     data = target.read_contexts().model_dump(by_alias=True, include={"current", "contexts"})
-    columns = (
-        Column("current", ""),
-        Column("name", "Context"),
-        Column("stateRepo", "State repo"),
-        Column("clusters", "Clusters", 1),
-        Column("signingKey", "Signing key", 2),
-    )
+    columns = [Column("current", ""), Column("name", "Context"), Column("stateRepo", "State repo")]
+    columns += [Column("clusters", "Clusters", 1), Column("signingKey", "Signing key", 2)]
     contexts = [
         {"name": name, "current": "*" if name == data["current"] else "", **context}
         for name, context in data["contexts"].items()
     ]
     empty = "no contexts; see demandops config set"
-    table = table_of(columns, contexts, REAL.now(), empty=empty)
-    show(output, data, [table])
+    cells = [[column.texts(each, REAL.now()) for column in columns] for each in contexts]
+    show(output, data, [Table(columns, cells, empty=empty)])
 
 
 @config.command("set")
@@ -149,13 +141,9 @@ def set_context(
       demandops config set fleet --clusters clusters.yaml
     """
     content = target.read_contexts()
-    options = {
-        "stateRepo": _absolute(state_repo),
-        "clusters": _absolute(clusters),
-        "signingKey": _absolute(signing_key),
-    }
+    options = {"stateRepo": state_repo, "clusters": clusters, "signingKey": signing_key}
     data = content.model_dump(by_alias=True, exclude_none=True)
-    given = {field: value for field, value in options.items() if value is not None}
+    given = {field: _absolute(value) for field, value in options.items() if value is not None}
     data["contexts"][name] = {**data["contexts"].get(name, {}), **given}
     if "stateRepo" not in data["contexts"][name]:
         raise click.UsageError(f"the context '{name}' is new, so give --state-repo")
@@ -164,11 +152,10 @@ def set_context(
     show("text", None, [f"context '{name}' set in {target.contexts_file()}"])
 
 
-def _absolute(place: str | None) -> str | None:
+def _absolute(place: str) -> str:
     # other text, such as a URL, stays as it is
-    if place is None or not Path(place).expanduser().exists():
-        return place
-    return str(Path(place).expanduser().resolve())
+    path = Path(place).expanduser()
+    return str(path.resolve()) if path.exists() else place
 
 
 @config.command("use")

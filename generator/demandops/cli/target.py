@@ -182,12 +182,9 @@ def hint_to_push() -> list[str]:
     return [f"{told}; commit and push to demand with them"] if files else []
 
 
-def _from_context(field: str) -> Callable[[], str | None]:
-    def default() -> str | None:
-        context = click.get_current_context().meta.get(_CONTEXT)
-        return getattr(context, field) if context else None
-
-    return default
+def _from_context(field: str) -> str | None:
+    context = click.get_current_context().meta.get(_CONTEXT)
+    return getattr(context, field) if context else None
 
 
 def context_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
@@ -265,7 +262,7 @@ signing_option = click.option(
     envvar="DEMANDOPS_SIGNING_KEY",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    default=_from_context("signing_key"),
+    default=partial(_from_context, "signing_key"),
     help="Sign the commits with this SSH key: a private key without a passphrase, or a public key "
     "whose private key is in an SSH agent; see docs/audit.md [env: DEMANDOPS_SIGNING_KEY].",
 )
@@ -276,7 +273,7 @@ clusters_option = click.option(
     envvar="DEMANDOPS_CLUSTERS",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    default=_from_context("clusters"),
+    default=partial(_from_context, "clusters"),
     help="A file that says how to reach the clusters; see docs/status.md [env: "
     "DEMANDOPS_CLUSTERS].",
 )
@@ -294,9 +291,7 @@ def names_of(*kinds: str) -> Callable[[click.Context, click.Parameter, str], lis
                 return []
             # offline, because a shell waits for the names while a person types
             with reader.opened_offline(address) as repo:
-                names = (
-                    {name for kind in kinds for name in all_names(repo, kind)} if repo else set()
-                )
+                names = {name for kind in kinds if repo for name in all_names(repo, kind)}
             return sorted(name for name in names if name.startswith(incomplete))
         except Exception:  # an error must not disturb a person who is typing
             return []
@@ -307,26 +302,18 @@ def names_of(*kinds: str) -> Callable[[click.Context, click.Parameter, str], lis
 def name_options(helps: dict[str, str], **more: Any) -> Callable[[Command], Command]:  # noqa: ANN401
     """Add an option for each name, which a shell completes; one for several is named in plural."""
 
-    return with_options(
-        *(
-            click.option(
-                f"--{name}",
-                f"{name}s" if more.get("multiple") else name,
-                shell_complete=names_of(f"{name}s"),
-                help=text,
-                **more,
-            )
-            for name, text in helps.items()
-        )
-    )
+    def option(name: str, text: str) -> Callable[[Command], Command]:
+        key, names = f"{name}s" if more.get("multiple") else name, names_of(f"{name}s")
+        return click.option(f"--{name}", key, shell_complete=names, help=text, **more)
+
+    return with_options(*(option(*each) for each in helps.items()))
 
 
 def options_for(repo: Reader, name: str, kinds: Iterable[str]) -> str:
     """Return a hint for a name that was given without the option that says what it is."""
-    meant = [
-        f"--{kind} {shlex.quote(name)}" for kind in kinds if name in all_names(repo, f"{kind}s")
-    ]
-    return f"; did you mean: {' or '.join(meant)}" if meant else ""
+    fitting = (kind for kind in kinds if name in all_names(repo, f"{kind}s"))
+    meant = " or ".join(f"--{kind} {shlex.quote(name)}" for kind in fitting)
+    return f"; did you mean: {meant}" if meant else ""
 
 
 def all_names(repo: Reader, kind: str) -> Iterator[str]:

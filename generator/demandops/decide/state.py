@@ -51,20 +51,15 @@ class State(World):
 
     @cached_property
     def plans(self) -> HashTrieMap[ReleaseKey, Release]:
-        """The releases that earlier decisions on this configuration planned.
-
-        So a decision need not plan them again to tell what it changes.
-        """
+        # of earlier decisions on this configuration, so that none plans what another has planned
         return HashTrieMap()
 
     @cached_property
     def usage(self) -> Usage:
-        """How much the services request."""
         return forbidden.whole_usage(self)
 
     @cached_property
     def names(self) -> Names:
-        """The names of all releases."""
         return collisions.all_names(self)
 
     def followed_by(

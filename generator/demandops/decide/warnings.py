@@ -55,6 +55,9 @@ class MissingInput:
     file: str
     reason: str
 
+    def __str__(self) -> str:
+        return f"application '{self.application}': {self.reason}"
+
     @property
     def warning(self) -> Fault:
         return fault(f"application '{self.application}'", self.reason).within(self.file)

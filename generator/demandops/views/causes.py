@@ -68,24 +68,16 @@ def causes(source: Source) -> list[Cause]:
 
 
 def _unread_or_invalid(source: Source) -> Iterator[Cause]:
+    repo: tuple[Kind, str] = "unread", "The state repo"
     if source.unread:
-        yield Cause(
-            "unread",
-            "The state repo",
-            "cannot be read, so this may be out of date",
-            "the operator of the Git server or of this program",
-            "mend what the text above names; the program tries again",
-            told=source.unread,
-        )
+        who = "the operator of the Git server or of this program"
+        how = "mend what the text above names; the program tries again"
+        why = "cannot be read, so this may be out of date"
+        yield Cause(*repo, why, who, how, told=source.unread)
     if source.push_denied:
-        yield Cause(
-            "unread",
-            "The state repo",
-            "takes no commit of this generator, so demands wait, and are refused after some time",
-            "the operator of the Git server",
-            "let the generator's account push to main",
-            told=source.push_denied,
-        )
+        why = "takes no commit of this generator, so demands wait, and are refused after some time"
+        who, how = "the operator of the Git server", "let the generator's account push to main"
+        yield Cause(*repo, why, who, how, told=source.push_denied)
     of_commits: dict[str, list[Problem]] = {}
     for problem in source.problems:
         of_commits.setdefault(problem.since or problem.file, []).append(problem)
@@ -104,10 +96,10 @@ def _unread_or_invalid(source: Source) -> Iterator[Cause]:
             else "the person who last changed it",
             source.remedy or "correct the file by pull request",
             f"git show {problem.since[:10]}" if problem.since else "demandops check .",
-            told="\n".join(str(each._replace(since="")) for each in (problem, *others))
+            change.time if change else None,
+            "\n".join(str(each._replace(since="")) for each in (problem, *others))
             if others
             else problem.message,
-            since=change.time if change else None,
         )
 
 
@@ -184,12 +176,11 @@ def _not_ready(source: Source) -> Iterator[Cause]:
         claims = [claim for name in names for claim in source.claims_of_releases[name]]
         applications: dict[str, None] = {}
         for name, release in zip(names, releases, strict=True):
-            # a connection is needed by the applications of the demands that hold it
-            applications |= dict.fromkeys(
-                release.applications
-                if isinstance(release, ServiceRelease)
-                else _applications_with(source, source.claims_of_releases[name])
-            )
+            if isinstance(release, ServiceRelease):
+                applications |= dict.fromkeys(release.applications)
+            else:  # the applications of the demands that hold the connection need it
+                behind = source.claims_of_releases[name]
+                applications |= dict.fromkeys(_applications_with(source, behind))
         yield Cause(
             kind,
             f"{len(names)} releases in {cluster}" if several else releases[0].description,

@@ -32,7 +32,7 @@ from demandops.repo.history.commit_message import PROPOSAL, REJECTS
 from demandops.repo.reader import Reader
 from demandops.views import vocabulary
 from demandops.views.rows import Column, Row, TextsOf, labels_of
-from demandops.views.source import Source, since_of, word_of, worst_word
+from demandops.views.source import Source, claims_behind, since_of, word_of, worst_word
 from demandops.views.vocabulary import Json, claim_data, lease_data, subject_text, time_data
 
 # How many of the newest commits are searched for events and for what is gone.
@@ -231,12 +231,10 @@ def domains_of(source: Source, nodes: Iterable[str]) -> list[str]:
 
 
 def nodes_of(claim: Claim) -> tuple[str, ...]:
-    held = claim.held
     if claim.is_on_application:
-        sources = (topic.source for _, topic in claim.application.all_inputs())
         delivered = (delivery.node for delivery in claim.application.deliver)
-        return tuple(sorted({*held.nodes, *sources, *delivered}))
-    return tuple(sorted({*held.nodes, *filter(None, (claim.connection.broker,))}))
+        return tuple(sorted({*claim.application.needed_nodes(), *delivered}))
+    return tuple(sorted({*claim.held.nodes, *filter(None, (claim.connection.broker,))}))
 
 
 def _subjects(claims: Iterable[Claim]) -> Json:
@@ -409,8 +407,11 @@ def _releases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
 
 
 def release_of(source: Source, release: Release) -> Json:
+    # that runs, or that an override stops
+    claims = source.claims_of_releases.get(release.name)
+    claims = claims_behind(source.state.ledger, release) if claims is None else claims
     status = source.status(release.name) if source.statuses else None
-    return _release(source, release, source.claims_of_releases[release.name], status)
+    return _release(source, release, claims, status)
 
 
 def _release_was(reader: Reader, entry: LogEntry, path: str) -> Json:

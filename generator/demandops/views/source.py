@@ -76,17 +76,15 @@ class Planned:
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
     # callers pass a ledger without suspended claims
-    return by_booking(claim for claim in claims_of(release, ledger) if needs(claim, release))
+    claims = claims_of(release, ledger)
+    if not isinstance(release, ServiceRelease):
+        return by_booking(claims)
+    service, key = release.service, release.key
+    return by_booking(c for c in claims if planner.takes(c.application, service, key))
 
 
 def by_booking(claims: Iterable[Claim]) -> list[Claim]:
     return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
-
-
-def needs(claim: Claim, release: Release) -> bool:
-    if not isinstance(release, ServiceRelease):
-        return True
-    return planner.takes(claim.application, release.service, release.key)
 
 
 class _Derived(Generic[_Value]):

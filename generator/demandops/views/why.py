@@ -7,17 +7,11 @@ about it in the vocabulary of docs/json.md.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from demandops.base.errors import (
-    DemandOpsError,
-    InvalidInput,
-    StateRepoError,
-    closest,
-    suggestion,
-)
+from demandops.base.errors import DemandOpsError, InvalidInput, StateRepoError, closest, suggestion
 from demandops.base.naming import Subject, SubjectKind, object_name
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
@@ -40,7 +34,7 @@ from demandops.repo.load import ledger_files
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import PendingProposal
 from demandops.views import kinds, vocabulary
-from demandops.views.kinds import effect_texts, nodes_of
+from demandops.views.kinds import effect_texts
 from demandops.views.source import Source, by_booking
 from demandops.views.vocabulary import Json
 
@@ -236,11 +230,8 @@ def explain(source: Source, thing: Thing, most: int = 10) -> Json:
         answer["state"] = last["decision"]["outcome"]
     answer["runs"] = answer["state"] in _RUNNING
     files = {claim["file"] for claim in answer.get("claims", ())}
-    reasons = (
-        f"application '{missing.application}': {missing.reason}"
-        for missing in (missing_inputs(source.state) if files else ())
-        if missing.file in files
-    )
+    lacking = missing_inputs(source.state) if files else ()
+    reasons = (str(missing) for missing in lacking if missing.file in files)
     answer["missing_inputs"] = list(dict.fromkeys(reasons))
     files = {thing.path, *(release["file"] for release in answer.get("releases", ()))}
     answer["not_rendered"] = sorted(files & source.not_rendered) if source.is_newest else []
@@ -315,7 +306,8 @@ def _subject(source: Source, thing: Thing) -> Json:
 
 def _demand(source: Source, thing: Thing) -> Json:
     name = thing.name
-    answer = _held_where(source, f"demand '{name}'", lambda claim: claim.demand == name)
+    answer = _held(source, source.state.ledger.claims_with("demand", name))
+    answer["what"] = f"demand '{name}'"
     if waiting := source.state.ledger.waiting.get(name):
         answer |= {"state": "waiting", "requesters": list(waiting.requesters)}
         answer |= {"file": waiting_path(name), "since": vocabulary.time_data(waiting.since)}
@@ -323,10 +315,10 @@ def _demand(source: Source, thing: Thing) -> Json:
 
 
 def _requester(source: Source, thing: Thing) -> Json:
-    name = thing.name
-    answer = _held_where(source, f"requester '{name}'", lambda claim: name in claim.requesters)
-    waiting = source.state.ledger.waiting.values()
-    waits = {each.demand for each in waiting if name in each.requesters}
+    name, ledger = thing.name, source.state.ledger
+    answer = _held(source, ledger.claims_with("requester", name))
+    answer["what"] = f"requester '{name}'"
+    waits = {each.demand for each in ledger.waiting.values() if name in each.requesters}
     if waits and answer["state"] == "gone":
         answer["state"] = "waiting"
     return answer | {"demands": sorted({*waits, *(claim["demand"] for claim in answer["claims"])})}
@@ -342,9 +334,8 @@ def _claim(source: Source, thing: Thing) -> Json:
 
 def _node(source: Source, thing: Thing) -> Json:
     node, domain = source.config.nodes.get(thing.name), source.config.domain_of.get(thing.name)
-    claims = [claim for claim in source.state.ledger if thing.name in nodes_of(claim)]
-    claims.sort(key=lambda claim: (str(claim.subject), claim.demand))
     running = (release for release in source.releases.values() if release.node.id == thing.name)
+    claims = _claims_where(source, lambda claim: claim.held.needs(thing.name))
     held = _held(source, claims, running)
     what = "not in the inventory"
     if node:
@@ -374,19 +365,17 @@ def _proposal(source: Source, thing: Thing) -> Json:
 
 
 def _appdef(source: Source, thing: Thing) -> Json:
-    def is_held(claim: Claim) -> bool:
-        return claim.is_on_application and claim.application.appdef == thing.name
-
-    return _used(_held_where(source, source.config.appdefs[thing.name].description, is_held))
+    held = _held(source, source.state.ledger.claims_with("definition", thing.name))
+    return _used(held | {"what": source.config.appdefs[thing.name].description})
 
 
 def _domain(source: Source, thing: Thing) -> Json:
     domain, of_node = source.config.domains[thing.name], source.config.domain_of
     nodes = sorted(id for id, each in of_node.items() if each.name == thing.name)
     approval = ", approval required" if domain.approval == "required" else ""
+    held = _held(source, _claims_where(source, lambda claim: claim.held.home in nodes))
     what = f"namespace {domain.namespace}, {len(nodes)} nodes{approval}"
-    answer = _held_where(source, what, lambda claim: claim.held.home in nodes)
-    return _used(answer | {"nodes": nodes})
+    return _used(held | {"what": what, "nodes": nodes})
 
 
 def _service(source: Source, thing: Thing) -> Json:
@@ -412,19 +401,17 @@ _EXPLAINED: dict[str, Callable[[Source, Thing], Json]] = {
 }
 
 
-def _held_where(source: Source, what: str, is_held: Callable[[Claim], bool]) -> Json:
-    claims = sorted(
-        filter(is_held, source.state.ledger), key=lambda claim: (str(claim.subject), claim.demand)
-    )
-    return {**_held(source, claims), "what": what}
+def _claims_where(source: Source, is_meant: Callable[[Claim], bool]) -> list[Claim]:
+    claims = filter(is_meant, source.state.ledger)
+    return sorted(claims, key=lambda claim: (str(claim.subject), claim.demand))
 
 
-def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | None = None) -> Json:
+def _held(source: Source, claims: Sequence[Claim], needed: Iterable[Release] | None = None) -> Json:
     """Return the claims and releases of a thing; by default the releases that the claims need."""
-    if releases is None:
+    if needed is None:
         keys, behind = {claim.key for claim in claims}, source.claims_of_releases.items()
-        names = (name for name, needed in behind if any(claim.key in keys for claim in needed))
-        releases = map(source.releases.__getitem__, names)
+        names = (name for name, own in behind if any(claim.key in keys for claim in own))
+        needed = map(source.releases.__getitem__, names)
     return {
         "state": kinds.state_of(source, claims) if claims else "gone",
         "requesters": list(requesters_of(claims)),
@@ -433,7 +420,7 @@ def _held(source: Source, claims: list[Claim], releases: Iterable[Release] | Non
         ],
         "releases": [
             kinds.release_of(source, release)
-            for release in sorted(releases, key=lambda release: release.name)
+            for release in sorted(needed, key=lambda release: release.name)
         ],
     }
 

@@ -27,15 +27,8 @@ from demandops.web.time_line import Event
 
 # The lists of the page, in the order of its navigation.
 LISTS = (
-    "demands",
-    "applications",
-    "releases",
-    "connections",
-    "nodes",
-    "requesters",
-    "leases",
-    "overrides",
-    "proposals",
+    *("demands", "applications", "releases", "connections", "nodes", "requesters", "leases"),
+    *("overrides", "proposals"),
 )
 NAVIGATION = (
     ("", "Overview"),
@@ -121,12 +114,10 @@ def _figures(asked: ViewRequest, events: list[Event]) -> list[Data]:
     figures.append({"count": len(used), "what": what, "parts": ()})
     proposed = len(source.proposals)
     waiting = sum(row.item["state"] == "waiting" for row in demands)
-    parts = []
-    if proposed:
-        parts.append((Part(f"{proposed} for approval", "proposals"), "busy"))
+    parts = [(Part(f"{proposed} for approval", "proposals"), "busy")] if proposed else []
     if waiting:
-        rows_waiting = {"q": exactly("state", "waiting")}
-        parts.append((Part(f"{waiting} for room", "demands", rows_waiting), "busy"))
+        query = {"q": exactly("state", "waiting")}
+        parts.append((Part(f"{waiting} for room", "demands", query), "busy"))
     what = Part("waiting", "proposals")
     figures.append({"count": proposed + waiting, "what": what, "parts": parts})
     moment = source.now if source.is_newest else source.entry.time
@@ -238,9 +229,6 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     events = [event for event in asked.events() if event.lane in lanes]
     span, events = time_line.within(events, asked.get("span"), now.now)
     chosen = None if now.is_newest else (now.entry.time, now.commit)
-    changed: list[str] = []
-    if asked.get("at"):
-        changed = now.reader().files_changed_by(now.commit)
     shown, page, pages = page_of(events, asked.page(), size=50)
     return "timeline.html.j2", {
         "strip": time_line.strip(events, now.now, span, chosen),
@@ -252,7 +240,7 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
         "total": len(events),
         "page": page,
         "pages": pages,
-        "changed": changed,
+        "changed": now.reader().files_changed_by(now.commit) if asked.get("at") else (),
         "is_cut": len(asked.follower.history) >= MOST_COMMITS,
     }
 

@@ -25,15 +25,8 @@ LANES = {
 }
 
 # The spans of time that a person can choose, in seconds; 0 means all known events.
-SPANS = {
-    "15min": 900,
-    "1h": 3600,
-    "6h": 6 * 3600,
-    "1d": 86400,
-    "7d": 7 * 86400,
-    "30d": 30 * 86400,
-    "all": 0,
-}
+SPANS = {"15min": 900, "1h": 3600, "6h": 6 * 3600}
+SPANS |= {"1d": 86400, "7d": 7 * 86400, "30d": 30 * 86400, "all": 0}
 
 # How many events a span that nobody chose must have, if there are more.
 _ENOUGH = 50
@@ -103,18 +96,14 @@ def within(events: Sequence[Event], span: str, now: datetime) -> tuple[str, list
     """
     if span not in SPANS:
         enough = events[min(_ENOUGH, 3 * len(events) // 4) - 1].time if len(events) > 1 else None
-        span = next(
-            (
-                name
-                for name, seconds in SPANS.items()
-                if enough and seconds and enough >= now - timedelta(seconds=seconds)
-            ),
-            "all",
+        holding = (
+            name
+            for name, seconds in SPANS.items()
+            if enough and seconds and enough >= now - timedelta(seconds=seconds)
         )
-    if not SPANS[span]:
-        return span, [*events]
+        span = next(holding, "all")
     start = now - timedelta(seconds=SPANS[span])
-    return span, [event for event in events if event.time >= start]
+    return span, [event for event in events if not SPANS[span] or event.time >= start]
 
 
 def strip(

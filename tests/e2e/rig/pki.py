@@ -12,23 +12,7 @@ import subprocess
 from pathlib import Path
 
 _CURVE = ("-pkeyopt", "ec_paramgen_curve:P-256")
-_EXTENSIONS = """
-[req]
-distinguished_name = subject
-[subject]
-[authority]
-basicConstraints = critical, CA:TRUE
-keyUsage = critical, digitalSignature, keyCertSign, cRLSign
-subjectKeyIdentifier = hash
-[signed]
-basicConstraints = critical, CA:FALSE
-keyUsage = critical, digitalSignature
-extendedKeyUsage = serverAuth, clientAuth
-subjectAltName = DNS:localhost, IP:127.0.0.1
-# Python 3.13 and later refuse a server whose certificate lacks these two extensions.
-subjectKeyIdentifier = hash
-authorityKeyIdentifier = keyid
-"""
+_EXTENSIONS = Path(__file__).with_name("openssl.cnf")
 
 
 class Pki:
@@ -45,10 +29,9 @@ def make(folder: Path) -> Pki:
     """Create the certificates and keys of a control plane, and write them into a folder."""
     folder.mkdir(parents=True)
     paths, signer = Pki(folder), folder / "ca.key"
-    (folder / "openssl.cnf").write_text(_EXTENSIONS)
 
     def certify(subject: str, certificate: Path, key: Path, *signed_by: Path) -> None:
-        options = ["-config", folder / "openssl.cnf", "-days", "30", "-subj", subject]
+        options = ["-config", _EXTENSIONS, "-days", "30", "-subj", subject]
         if signed_by:
             options += ["-extensions", "signed", "-CA", signed_by[0], "-CAkey", signed_by[1]]
         else:

@@ -178,6 +178,7 @@ def test_the_command_that_stops_a_release_stops_it(
     assert shown.look("/release", name=release).texts("h1") != [f"Release {release} unknown"]
     (name,) = state.files("overrides/suspend-")
     assert told.format(name) in shown.look("/").text
+    assert release in shown.look("/thing", kind="override", name=Path(name).stem).text
     gone = {Path(path).stem for path in before - set(state.manifests())}
     assert release in gone
     named = {word for word in re.split(r"[ ,.]+", promise) if word.startswith(("od-", "mqtt-"))}

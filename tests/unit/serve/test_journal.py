@@ -35,7 +35,7 @@ from tests.kit.rig import journaled
 PROPOSAL = ProposalRecord("demand/x", ("a",))
 
 
-def entry(name: str, goal: object = "wish", proposal: ProposalRecord | None = None) -> Ticket:
+def entry(name: str, goal: object = "ü 🚗", proposal: ProposalRecord | None = None) -> Ticket:
     received = "2026-01-31T12:00:00+00:00"
     ticket = journaled(f"op-{name}", {"id": goal}, received, "bbbb")
     ticket.proposal = proposal

@@ -145,7 +145,6 @@ def image(name: str, repository: str, state_repo: str, directory: Path, output: 
 # each further service reads the outputs of the service before it. One image contains the nodes of
 # all services. What demands decide of a node is a ROS parameter, and changes while the node runs.
 
-_INPUT = re.compile(r"(?P<role>[^=]+)=(?P<type>.+)")
 _TYPE = re.compile(r"(?P<package>[A-Za-z]\w*)(/msg)?/(?P<name>[A-Za-z]\w*)", re.ASCII)
 _SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
 
@@ -162,13 +161,14 @@ class _Service:
 
 
 def _input(text: str) -> tuple[str, str]:
-    if not (match := _INPUT.fullmatch(text)):
+    role, _, type = text.partition("=")
+    if not (role and type):
         raise ValueError(f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image")
-    type = _TYPE.fullmatch(match["type"])
-    full = f"{type['package']}/msg/{type['name']}" if type else "package/msg/Name"
-    if match["type"] != full:
-        raise ValueError(f"'{text}' has no message type of ROS 2; write {match['role']}={full}")
-    return match["role"], full
+    match = _TYPE.fullmatch(type)
+    full = f"{match['package']}/msg/{match['name']}" if match else "package/msg/Name"
+    if type != full:
+        raise ValueError(f"'{text}' has no message type of ROS 2; write {role}={full}")
+    return role, full
 
 
 def _service(text: str) -> _Service:
@@ -261,12 +261,10 @@ def application(  # noqa: PLR0913 - as many as options
     # a demand can name only nodes in an access domain
     nodes = sorted(config.usable_nodes(), key=lambda id: (config.nodes[id].type != "edge", id))
     if not (node or nodes):
-        raise StateRepoError(
-            "the inventory has no node in an access domain, so no demand can be made; add one "
-            "first, in inventory/nodes.yaml"
-        )
+        message = "the inventory has no node in an access domain, so no demand can be made"
+        raise StateRepoError(f"{message}; add one first, in inventory/nodes.yaml")
     node = node or nodes[0]
-    description = description or f"Runs {', '.join(service.name for service in services)}"
+    description = description or f"Runs {', '.join(names)}"
     files = _application_files(name, description, types, services, image, config)
     path = f"appdefs/{name}/demand.yaml"
     files[path], is_allowed = _example_demand(path, name, types, node, config)
@@ -384,11 +382,9 @@ def _application_files(
                 f'    "{parameter}": {modules[role]},' for role, parameter in parameters.items()
             ),
         }
-        for path, template in (
-            (f"values/{service.name}.yaml.j2", "values.yaml.j2"),
-            (f"nodes/{service.name}.py", "example-node"),
-        ):
-            files[f"{root}/{path}"] = _filled(texts[template], given | own)
+        values, node = f"{root}/values/{service.name}.yaml.j2", f"{root}/nodes/{service.name}.py"
+        files[values] = _filled(texts["values.yaml.j2"], given | own)
+        files[node] = _filled(texts["example-node"], given | own)
         inputs = {service.role: f"{service.name}.{_RESULT}"}
         types_of = {service.role: next(iter(types.values()))}  # the example passes these on
     fields = {

@@ -28,13 +28,7 @@ from demandops.cli import formats, target
 from demandops.cli.output import busy, done, errors, fitted, terminal_width
 from demandops.cli.queries.commits import differences, entry_lines, release_lines
 from demandops.decide.planning.overrides import suspended_claims
-from demandops.decide.state import (
-    FileChange,
-    ReleaseChange,
-    State,
-    described,
-    planned_releases,
-)
+from demandops.decide.state import FileChange, ReleaseChange, State, described, planned_releases
 from demandops.model.ledger.claim import requesters_of
 from demandops.model.release import Release, ServiceRelease, claims_of
 from demandops.render import gitops

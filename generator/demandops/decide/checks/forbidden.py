@@ -299,8 +299,6 @@ class NoRoom(Refused):
 
 # From the strictest to the least strict.
 _STRICTNESS: tuple[VersionPolicy, ...] = ("refuse", "separate", "update", "upgrade")
-# With ``separate`` each version is an application of its own, so only shared services can differ.
-_REFUSING = ("refuse", "separate")
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,7 +325,8 @@ class Difference:
 
     @property
     def is_refused(self) -> bool:
-        return self.policy in _REFUSING
+        # with ``separate``, each version is an application of its own: shared services differ
+        return self.policy in ("refuse", "separate")
 
     def approval_reason(self) -> str:
         """Return why a person must approve the difference, or ``""``; of no use if refused."""

@@ -290,7 +290,7 @@ class ConfigReader:
         else a mapping.
         """
         items: dict[str, Model] = {}
-        places = self.places[collection] = {}
+        places = self.places[collection]
         kind: type[Any] = list if key else dict
         for file in self.files_of[collection] or [collection]:
             entries: Any = None

@@ -474,7 +474,6 @@ class Demand:
         return tuple(held for held in helds if isinstance(held, Application))
 
     def with_each(self: AnyDemand, change: Callable[[Application], Application]) -> AnyDemand:
-        """Return the demand with a change of each application."""
         demanded = (
             replace(item, held=change(item.held)) if isinstance(item.held, Application) else item
             for item in self.demanded

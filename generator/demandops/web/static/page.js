@@ -55,7 +55,7 @@ function say(text) {
   live.classList.toggle("current", /^(live|updated)$/.test(text));
 }
 
-// Writes a duration like span() in config/durations.py: 3h20m
+// Writes a duration like span() in model/config/base_model.py: 3h20m
 function span(seconds) {
   const units = [[86400, "d"], [3600, "h"], [60, "m"], [1, "s"]], left = Math.floor(Math.abs(seconds));
   const place = units.findIndex(([size]) => left >= size || size === 1);
