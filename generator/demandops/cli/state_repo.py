@@ -103,16 +103,12 @@ def init(
     data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
     lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
     if not url:
-        lines.append(
-            "no cluster can follow the state repo yet: "
-            "set the url for the clusters in demandops.yaml"
-        )
+        way = "set the url for the clusters in demandops.yaml"
+        lines.append(f"no cluster can follow the state repo yet: {way}")
     else:
-        cluster = "c-its" if example == "experiment" else "CLUSTER"
-        lines.append(
-            f"to make a cluster follow the state repo: git -C {directory} show "
-            f"main:bootstrap/{cluster}.yaml | kubectl apply -f -"
-        )
+        file = f"bootstrap/{'c-its' if example == 'experiment' else 'CLUSTER'}.yaml"
+        way = f"git -C {directory} show main:{file} | kubectl apply -f -"
+        lines.append(f"to make a cluster follow the state repo: {way}")
     if bare:
         lines.append(f"to see or edit the files of the state repo: git clone {directory}")
     if example == "none":
@@ -282,8 +278,7 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
         busy("rendering again") as report,
     ):
         verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
-    rows: list[Json] = []
-    lines: list[str] = []
+    rows, lines = list[Json](), list[str]()
     for verdict in verdicts:
         row = {name: None if value == "" else value for name, value in asdict(verdict).items()}
         message = row.pop("fault")
@@ -373,23 +368,17 @@ def journal(state_repo: str, set_aside: bool, drop: str | None, output: str) -> 
     journals = list(find_journals(folder, REAL.now(), set_aside=set_aside))
     rows, lines = [], []
     for each in journals:
-        demands = [
-            {
-                "operation_id": ticket.operation,
-                "received": ticket.received.isoformat(),
-                "goal": ticket.demand.goal,
-            }
-            for ticket in each.demands
-        ]
-        rows.append(
-            {
-                "file": str(each.file),
-                "faults": [asdict(fault("", each.damage))] if each.damage else [],
-                "set_aside": str(each.set_aside) if each.set_aside else None,
-                "demands": demands,
-            }
-        )
-        lines += [f"{demand['operation_id']}  received {demand['received']}" for demand in demands]
+        row: Json = {
+            "file": str(each.file),
+            "faults": [asdict(fault("", each.damage))] if each.damage else [],
+            "set_aside": str(each.set_aside) if each.set_aside else None,
+            "demands": [],
+        }
+        rows.append(row)
+        for ticket in each.demands:
+            of_ticket = {"operation_id": ticket.operation, "received": ticket.received.isoformat()}
+            row["demands"].append(of_ticket | {"goal": ticket.demand.goal})
+            lines.append("{operation_id}  received {received}".format(**of_ticket))
         if each.set_aside:
             lines.append(f"the damaged journal {each.file} is now called {each.set_aside}")
         elif each.damage:

@@ -10,7 +10,6 @@ from typing import Any
 from demandops.base.naming import Subject
 from demandops.model.config.base_model import plain
 from demandops.model.config.override import Override, format_time
-from demandops.model.config.registry import ImagePin
 from demandops.model.demand.demand import Lease
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import Claim
@@ -81,11 +80,11 @@ def release_data(release: Release) -> Json:
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
-    names = override.effects() if effects is None else effects
+    names, written = override.effects() if effects is None else effects, plain(override)
     return {
         "name": override.name,
         "file": override.path,
-        "effects": {name: _plain(getattr(override, name)) for name in names},
+        "effects": {name: written[name] for name in names},
         "priority": override.priority,
         "owner": override.owner,
         "until": time_data(override.end),
@@ -95,13 +94,6 @@ def override_data(override: Override, effects: Iterable[str] | None = None) -> J
 
 def proposal_data(proposal: PendingProposal) -> Json:
     return asdict(proposal) | {"since": time_data(proposal.since)}
-
-
-def _plain(value: Any) -> Any:  # noqa: ANN401
-    # as the override's file has it, including the nulls of a patch
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value
 
 
 def decision_text(decision: Json) -> str:

@@ -341,9 +341,8 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
         outcome = "proposed" if decision.approval else decision.outcome
         if output == "text":
             say(f"Request {index}: '{decision.request.id}' would be {outcome}")
-            for rule in decision.approval:
-                say(f"  needs approval: {rule} requires it")
-            lines = [*release_lines(decision.releases)]
+            lines = [f"needs approval: {rule} requires it" for rule in decision.approval]
+            lines += release_lines(decision.releases)
             for path, text in sorted(decision.files.items()):
                 lines.append(f"{'remove' if text is None else 'write '} {path}")
             for line in lines:

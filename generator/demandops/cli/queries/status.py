@@ -90,9 +90,8 @@ def status(
     """
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     if wait and not any(cluster.kubeconfig for cluster in clusters.values()):
-        raise click.UsageError(
-            "--wait needs --clusters FILE with a kubeconfig: without one the state is unknown"
-        )
+        message = "--wait needs --clusters FILE with a kubeconfig: without one the state is unknown"
+        raise click.UsageError(message)
     with reader.opened(state_repo) as repo:
         source = read_status(repo, clusters, request_timeout)
         end, told = REAL.monotonic() + timeout, ""
@@ -136,9 +135,8 @@ def status(
         errors.print(f"warning: cluster '{name}' cannot be read: {reason}")
     unwatched = ", ".join(f"'{name}'" for name in source.unwatched)
     if unwatched and output != "json":
-        errors.print(
-            f"the state of cluster {unwatched} is unknown: give --clusters FILE (docs/status.md)"
-        )
+        way = "give --clusters FILE (docs/status.md)"
+        errors.print(f"the state of cluster {unwatched} is unknown: {way}")
     if wrong := amiss(source, clusters):
         errors.print(f"not well: {wrong}")
         raise click.exceptions.Exit(1)
@@ -158,14 +156,10 @@ def ask_clusters(
     clusters: Mapping[str, ClusterAccess],
     patience_s: int = _PATIENCE_S,
 ) -> Source:
-    if unknown := sorted(clusters.keys() - source.config.clusters.keys()):
-        raise InvalidInput(
-            fault(
-                "--clusters",
-                f"the inventory has no cluster '{name}'{suggestion(name, source.config.clusters)}",
-            )
-            for name in unknown
-        )
+    known = source.config.clusters
+    if unknown := sorted(clusters.keys() - known.keys()):
+        texts = (f"the inventory has no cluster '{n}'{suggestion(n, known)}" for n in unknown)
+        raise InvalidInput(fault("--clusters", text) for text in texts)
     caches = {
         name: ObjectCache(name, cluster, lambda: None)
         for name, cluster in clusters.items()
@@ -174,12 +168,8 @@ def ask_clusters(
     if not caches:
         return source
     # all clusters are read at the same time, so that a slow cluster does not delay the others
-    threads = {
-        name: REAL.start_thread(
-            f"read-{name}", partial(cache.read_once, source.watched_objects[name])
-        )
-        for name, cache in caches.items()
-    }
+    reads = {name: partial(c.read_once, source.watched_objects[name]) for name, c in caches.items()}
+    threads = {name: REAL.start_thread(f"read-{name}", read) for name, read in reads.items()}
     end = REAL.monotonic() + patience_s
     with busy("asking the clusters"):
         for name, thread in threads.items():
