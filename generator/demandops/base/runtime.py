@@ -20,7 +20,7 @@ from datetime import datetime, timezone
 
 from demandops.base.errors import DemandOpsError, Unsound
 
-log = logging.getLogger("demandops")
+log = logging.getLogger("demandops")  # of the whole program
 
 Thread = threading.Thread
 

@@ -16,10 +16,8 @@ from typing import Any
 
 from demandops.base.errors import InvalidInput, Unsound
 from demandops.base.quoting import quoted
-from demandops.base.runtime import REAL, Runtime
+from demandops.base.runtime import REAL, Runtime, log
 from demandops.cluster.clusters_file import own_cluster_api, reason_of
-
-log = logging.getLogger("demandops")
 
 _LEASE_S = 15  # how long a Lease is valid if nobody renews it
 _RENEW_WITHIN_S = 10  # a leader that has not renewed its Lease for so long ends its process

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from demandops.base.quoting import one_line
-from demandops.base.runtime import REAL, Runtime
+from demandops.base.runtime import REAL, Runtime, log
 from demandops.cluster.clusters_file import ClusterAccess, reason_of
 from demandops.cluster.watches import CONNECT_S, WATCH_S, keep_watching
 from demandops.decide.discovery import ClusterNode
 from demandops.model.config.config import Config
 from demandops.model.config.inventory import NODE_LABEL, Cluster, Discovery
-
-log = logging.getLogger("demandops")
 
 # How many nodes one answer has; each lists its images, so that all together may be large
 _PAGE = 500

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
-import logging
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -16,7 +15,7 @@ from demandops.base import http_call
 from demandops.base.addresses import in_url
 from demandops.base.errors import InvalidInput
 from demandops.base.http_call import NoAnswer
-from demandops.base.runtime import REAL, Runtime
+from demandops.base.runtime import REAL, Runtime, log
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import REQUESTED_AT, ClusterDomain, Flux, ObjectSelector
@@ -89,8 +88,6 @@ def _send(
 # 1.9 begins a second reconciliation right after the first, the second may read the status from
 # before the first. Kustomize-controller then forgets which objects the first reconciliation
 # created, and never removes them.
-
-log = logging.getLogger("demandops")
 
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 # The next fetch begins at least so long after Flux has applied what the last fetch brought. Two

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
@@ -11,7 +10,7 @@ from functools import cache, partial
 from typing import Literal
 
 from demandops.base.errors import Refused
-from demandops.base.runtime import REAL, Runtime
+from demandops.base.runtime import REAL, Runtime, log
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import (
     ClusterDomain,
@@ -41,8 +40,6 @@ from demandops.render.gitops import (
     domains_by_cluster,
     project_of,
 )
-
-log = logging.getLogger("demandops")
 
 # ---- the targets: what a release is on its cluster ----
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
@@ -10,11 +9,9 @@ from typing import Any
 
 from demandops.base.errors import InvalidInput
 from demandops.base.quoting import one_line
-from demandops.base.runtime import REAL, Runtime
+from demandops.base.runtime import REAL, Runtime, log
 from demandops.cluster.clusters_file import ClusterAccess, own_cluster_api, reason_of
 from demandops.cluster.health import ClusterDomain, Health, Key, ObjectSelector, health_reader
-
-log = logging.getLogger("demandops")
 
 _APIS = {
     "Kustomization": ("kustomize.toolkit.fluxcd.io", "v1", "kustomizations"),

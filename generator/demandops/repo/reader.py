@@ -26,7 +26,7 @@ from demandops.repo import verification
 from demandops.repo.git import repository as repositories
 from demandops.repo.git import tree as trees
 from demandops.repo.git.remote_repository import Slot, connect, is_url
-from demandops.repo.git.repository import StateRepository, opening, reading
+from demandops.repo.git.repository import StateRepository, reading, using
 from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry, PathHistory, Person
 from demandops.repo.history.commit_message import PROPOSAL
@@ -48,14 +48,14 @@ class Reader:
     @classmethod
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
         with ExitStack() as undo:
-            with opening(f"the data folder of {address}"):
+            with using(f"the data folder of {address}"):
                 # The clone of a URL stays on the disk for later readers. It is in a folder of
                 # readers, so that none takes over a generator's journal.
                 is_cloned = is_url(address) or (not only_read and repositories.needs_push(address))
                 slot = Slot(settings.data_home(address) / "reader") if is_cloned else None
             if slot is not None:
                 undo.callback(slot.close)
-            with opening(address):
+            with using(address):
                 repository = connect(address, slot.folder if slot else Path(), only_read=only_read)
                 reader = cls(repository, repository.refresh(), slot)
             undo.pop_all()

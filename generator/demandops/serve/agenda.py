@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
@@ -15,7 +14,7 @@ from typing import Literal
 
 from demandops.base.errors import Fault, InvalidInput, OverBudget, OverLimit, fault
 from demandops.base.quoting import quoted
-from demandops.base.runtime import Runtime
+from demandops.base.runtime import Runtime, log
 from demandops.decide.booking import Drain
 from demandops.decide.decision import Checkpoint, decide
 from demandops.decide.state import State
@@ -29,8 +28,6 @@ from demandops.model.ledger.records import in_turn
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.journal import Receipt, Ticket
 from demandops.serve.node_discovery import NodeDiscovery
-
-log = logging.getLogger("demandops")
 
 # The longest time between two looks at the list; short, because a person may set the clock.
 LONGEST_WAIT_S = 60.0

@@ -9,7 +9,6 @@ decides what happens to the demands of a proposal, and this module carries that 
 from __future__ import annotations
 
 import json
-import logging
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -19,6 +18,7 @@ from typing import TypeAlias
 from demandops.base import errors
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused
 from demandops.base.quoting import quoted
+from demandops.base.runtime import log
 from demandops.base.settings import PROPOSAL_LIMIT
 from demandops.decide.decision import Decision
 from demandops.decide.state import State
@@ -54,8 +54,6 @@ from demandops.serve.proposal import (
     releases,
     waiting_text,
 )
-
-log = logging.getLogger("demandops")
 
 _MOST_TOLD = 20  # faults in the comment on a pull request
 

@@ -18,7 +18,6 @@ journals what has arrived. The worker's thread makes all other changes of state.
 
 from __future__ import annotations
 
-import logging
 from collections import Counter, OrderedDict, deque
 from collections.abc import Collection, Hashable, Iterable, Sequence
 from dataclasses import replace
@@ -28,10 +27,8 @@ from operator import attrgetter
 from demandops.base import errors
 from demandops.base.errors import DemandOpsError, InvalidInput
 from demandops.base.quoting import quoted
-from demandops.base.runtime import Runtime
+from demandops.base.runtime import Runtime, log
 from demandops.serve.journal import Journal, ProposalRecord, Receipt, Ticket, TicketState
-
-log = logging.getLogger("demandops")
 
 # ---- the queue of demands: requesters take turns, and related demands keep their order ----
 #

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -11,12 +10,12 @@ from pathlib import Path
 
 from demandops.base import settings
 from demandops.base.errors import Refused
-from demandops.base.runtime import REAL, Runtime
+from demandops.base.runtime import REAL, Runtime, log
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Demand
 from demandops.model.demand.goals import read_goal
 from demandops.repo.git.remote_repository import Slot, connect
-from demandops.repo.git.repository import opening, reading
+from demandops.repo.git.repository import reading, using
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import commit_log
 from demandops.repo.load import snapshot as snapshots
@@ -26,8 +25,6 @@ from demandops.serve.approvals import Approvals
 from demandops.serve.demands import Demands, Remote
 from demandops.serve.journal import Listener, Ticket, open_journal
 from demandops.serve.worker import Worker
-
-log = logging.getLogger("demandops")
 
 _STOP_TIMEOUT_S = 5.0
 # How much longer a stop waits for the threads; a running call of git or ssh-keygen ends in it.
@@ -64,11 +61,11 @@ class Generator:
         heartbeat = heartbeat_in(settings.alive_file())
         signer = Signer(signing_key) if signing_key else None
         with ExitStack() as undo:
-            with opening(f"the data folder of {state_repo}"):
+            with using(f"the data folder of {state_repo}"):
                 self._slot = Slot(data or settings.data_home(state_repo))
                 undo.callback(self._slot.close)
                 self._journal = open_journal(self._slot.folder)
-            with opening(state_repo):
+            with using(state_repo):
                 repository = connect(state_repo, self._slot.folder, allow_offline=start_offline)
                 repository.signer, repository.runtime = signer, runtime
 

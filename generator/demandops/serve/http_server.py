@@ -6,7 +6,6 @@ import errno
 import hashlib
 import hmac
 import ipaddress
-import logging
 import re
 import socket
 from collections.abc import Callable
@@ -23,7 +22,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from demandops.base.addresses import in_url
 from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
-from demandops.base.runtime import REAL
+from demandops.base.runtime import REAL, log
 
 # ---- the server of the webhook and of the page ----
 #
@@ -172,8 +171,6 @@ def url_of(listening: socket.socket) -> str:
 # ---- the inbound webhook: a Git server reports a push, and the generator fetches at once ----
 #
 # Notifications are untrusted: their signature is checked, and their content is not read.
-
-log = logging.getLogger("demandops")
 
 _PATH = "/push"
 # The largest body that GitHub sends, in bytes; a body is hashed and not stored.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 import re
 from collections.abc import Callable, Hashable, Iterable, Iterator
@@ -17,6 +16,7 @@ from typing import Any, Literal
 
 from demandops.base.errors import DemandOpsError, Refused, StateRepoError, Unsound
 from demandops.base.quoting import quoted
+from demandops.base.runtime import log
 from demandops.cluster.health import Target
 from demandops.cluster.rollouts import targets_of_decision
 from demandops.decide.decision import Decision, Outcome
@@ -27,8 +27,6 @@ from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo.git.objects import sync_folder
 from demandops.repo.git.remote_repository import lock
 from demandops.repo.git.repository import disk_error
-
-log = logging.getLogger("demandops")
 
 # ---- a demand under way, from its submission to its receipt ----
 

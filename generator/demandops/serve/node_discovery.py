@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
 
 from demandops.base.errors import InvalidInput
-from demandops.base.runtime import Runtime
+from demandops.base.runtime import Runtime, log
 from demandops.decide.discovery import ClusterNode, Discovered, discover
 from demandops.decide.state import State
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.config.discovered import DISCOVERED_ROOT, InvalidConfig, path_of
 from demandops.repo.write.commit_batch import CommitBatch
-
-log = logging.getLogger("demandops")
 
 # All nodes of each cluster that was read, of those for which a configuration asks. It must return
 # at once. A cluster that cannot be reached has the nodes that it last had.

@@ -8,7 +8,6 @@ pull request in step.
 from __future__ import annotations
 
 import json
-import logging
 import re
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Sequence
@@ -18,7 +17,7 @@ from typing import TypeAlias
 
 from demandops.base.errors import DemandOpsError, Fault, InvalidInput, TurnedDown, Withdrawn
 from demandops.base.quoting import harmless, one_line
-from demandops.base.runtime import Runtime, Thread
+from demandops.base.runtime import Runtime, Thread, log
 from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.admission import permission
 from demandops.decide.decision import Decision, admit, decide
@@ -31,8 +30,6 @@ from demandops.repo.forge import Forge, ForgeError, PullRequest, forge_for
 from demandops.repo.history import commit_message
 from demandops.repo.history.commit_log import LogEntry
 from demandops.serve.journal import ProposalRecord, Ticket
-
-log = logging.getLogger("demandops")
 
 Decided: TypeAlias = list[tuple[Ticket, Decision]]
 Failed: TypeAlias = list[tuple[Ticket, DemandOpsError]]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from math import inf
 
 from demandops.base import errors
 from demandops.base.errors import DemandOpsError, StateRepoError
+from demandops.base.runtime import log
 from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.model.config.config import Config
@@ -29,8 +29,6 @@ from demandops.serve.demands import Demands
 from demandops.serve.journal import Receipt, Ticket
 from demandops.serve.node_discovery import NodeDiscovery, NodesOf
 from demandops.templating.evaluator import DEMAND_S, processor_time
-
-log = logging.getLogger("demandops")
 
 # The worker runs in one thread, the only one that writes to the state repo. Demands go first, so a
 # fetch stops when a demand arrives. The push of the demand finds new commits just as the fetch

@@ -12,7 +12,6 @@ only what changed since.
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import socket
@@ -29,9 +28,8 @@ from typing import Any
 
 from demandops.base import errors
 from demandops.base.errors import Fault, InvalidInput, OverLimit
+from demandops.base.runtime import log
 from demandops.templating.values import SchemaTask, ValuesTask
-
-log = logging.getLogger("demandops")
 
 # How many seconds of processor time the evaluations of one demand may take together. The values of
 # a service with 8,000 topics take half of it.

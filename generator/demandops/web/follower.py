@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
@@ -11,7 +10,7 @@ from itertools import islice
 
 from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import one_line
-from demandops.base.runtime import REAL
+from demandops.base.runtime import REAL, log
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.watches import object_caches
 from demandops.repo.git.repository import reading
@@ -22,8 +21,6 @@ from demandops.views.source import Source, word_of
 from demandops.views.vocabulary import commit_data
 from demandops.web import time_line
 from demandops.web.time_line import Event
-
-log = logging.getLogger("demandops")
 
 # How many of the newest commits the time line shows.
 MOST_COMMITS = 5_000

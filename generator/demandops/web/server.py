@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shlex
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
@@ -28,6 +27,7 @@ from demandops import __version__
 from demandops.base import settings
 from demandops.base.errors import DemandOpsError, InvalidInput
 from demandops.base.quoting import escaped, lines
+from demandops.base.runtime import log
 from demandops.model.config.base_model import parse_time, relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
@@ -41,8 +41,6 @@ from demandops.web.page_views import NAVIGATION, VIEWS, View, ViewRequest
 # No request changes anything, and no page loads anything from another host. Templates escape the
 # HTML in every value that they print. They also escape invisible characters, except in the fields
 # of the form, which send their values back.
-
-log = logging.getLogger("demandops")
 
 _HERE = Path(__file__).parent
 _HEADERS = {

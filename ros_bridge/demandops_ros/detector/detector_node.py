@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from importlib import import_module
 from math import inf
@@ -15,7 +14,7 @@ import click
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.base.errors import InvalidInput, fault
 from demandops.base.quoting import one_line, quoted
-from demandops.base.runtime import REAL
+from demandops.base.runtime import REAL, log
 from demandops.base.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from demandops.base.strict_yaml import read_input
 from demandops.detect.condition import entity_in
@@ -49,8 +48,6 @@ from demandops_ros.node_parameters import (
     ros_name,
     ros_name_or_none,
 )
-
-log = logging.getLogger("demandops")
 
 # ---- its parameters ----
 

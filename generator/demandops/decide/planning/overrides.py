@@ -210,7 +210,7 @@ def apply_overrides(release: Release, world: World) -> Release | None:
         return release
     config, claims = world.config, claims_of(release, world.ledger)
     traits = _traits(release, claims)
-    if service_denied_by(release, world) is not None:
+    if isinstance(release, ServiceRelease) and denied_by(traits, world):
         return None
     kept = {claim.keeping_override for claim in claims}
     by = []

@@ -9,7 +9,6 @@ read, and does not take it), or finds the remote *away*. Words only pick a remed
 from __future__ import annotations
 
 import fcntl
-import logging
 import os
 import re
 import shutil
@@ -28,14 +27,12 @@ from pygit2 import Oid, Repository
 from demandops.base.addresses import holds_secret, without_secrets
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import one_line, quoted
-from demandops.base.runtime import REAL
+from demandops.base.runtime import REAL, log
 from demandops.base.settings import MAIN_BRANCH, data_home
 from demandops.repo.git import child_processes
 from demandops.repo.git import repository as repositories
 from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.repository import MAIN, RemoteAway, StateRepository, Unavailable
-
-log = logging.getLogger("demandops")
 
 # ---- one git command with a remote, and what came of it ----
 
@@ -278,11 +275,8 @@ class RemoteRepository(StateRepository):
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
         # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
-        try:
-            with self.new.packed(commit):
-                pushed = self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
-        except (pygit2.GitError, OSError) as error:
-            raise repositories.access_error(error, f"the clone {self._folder}") from None
+        with repositories.using(f"the clone {self._folder}"), self.new.packed(commit):
+            pushed = self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         if not pushed.took(MAIN):
             if pushed.line_of(MAIN)[0] == "[rejected]":  # git sent nothing
                 return False

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import errno
-import logging
 import os
 import re
 import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import pygit2
 from pygit2 import Oid, Repository, Tree
 
 from demandops.base.errors import StateRepoError, Unsound
-from demandops.base.runtime import REAL, Runtime
+from demandops.base.runtime import REAL, Runtime, log
 from demandops.base.settings import MAIN_BRANCH
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.repo.git import child_processes
@@ -29,8 +28,6 @@ TIMEOUT_S = 120
 # From this age on, a branch's lock counts as left behind by a killed process: Git locks a branch
 # only for milliseconds.
 _STALE_LOCK_S = 5.0
-
-log = logging.getLogger("demandops")
 
 
 class Unavailable(StateRepoError):
@@ -154,11 +151,12 @@ def access_error(error: Exception, address: str, objects: Repository | None = No
 
 
 @contextmanager
-def opening(address: str) -> Iterator[None]:
+def using(address: str, objects: Repository | None = None) -> Iterator[None]:
+    # an error of the system or of libgit2 then names the address
     try:
         yield
     except Exception as error:
-        raise access_error(error, address) from None
+        raise access_error(error, address, objects) from None
 
 
 @contextmanager
@@ -225,11 +223,9 @@ class StateRepository:
                 "with `demandops init DIR --bare`"
             )
         self.objects, self.new = objects, NewObjects(objects)
-        try:
+        with using(self.address, objects):
             self._require_usable(path)
             _ = self.objects[self.tip()].peel(pygit2.Commit).tree
-        except (pygit2.GitError, KeyError, OSError) as error:
-            raise access_error(error, self.address, self.objects) from None
 
     def _require_usable(self, path: Path) -> None:
         borrowed = Path(self.objects.path) / "objects" / "info" / "alternates"
@@ -361,23 +357,21 @@ class StateRepository:
         return commit == other or trees.includes(self.reopened(), commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        pair = self._trees(commit, other)
-        if pair is None:
-            return False
-        if path in ("", "."):
-            return pair[0].id == pair[1].id
-        return trees.entry(pair[0], path) is not None and not trees.differ(*pair, (path,))
+        with suppress(StateRepoError):
+            new, old = self._trees(commit, other)
+            if path in ("", "."):
+                return new.id == old.id
+            return trees.entry(new, path) is not None and not trees.differ(new, old, (path,))
+        return False
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
-        pair = self._trees(since, commit)
-        return None if pair is None else sorted(path for path, _ in trees.differences(*pair))
+        with suppress(StateRepoError):
+            return sorted(path for path, _ in trees.differences(*self._trees(since, commit)))
+        return None
 
-    def _trees(self, commit: str, other: str) -> tuple[Tree, Tree] | None:
+    def _trees(self, commit: str, other: str) -> tuple[Tree, Tree]:
         objects = self.reopened()
-        try:
-            return trees.commit_of(objects, commit).tree, trees.commit_of(objects, other).tree
-        except StateRepoError:
-            return None
+        return trees.commit_of(objects, commit).tree, trees.commit_of(objects, other).tree
 
     def renew_if_damaged(self) -> bool:
         """Let git check a clone, and replace a damaged one; return whether it was replaced."""

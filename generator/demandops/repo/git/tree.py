@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 import shutil
@@ -15,6 +14,7 @@ from pygit2.enums import ConfigLevel, DeltaStatus, FileMode, SortMode
 
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import quoted
+from demandops.base.runtime import log
 
 # Sync the files that libgit2 writes, so that a commit is on the disk before anybody learns of it.
 pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
@@ -38,7 +38,7 @@ for _read in (
         for _level in (ConfigLevel.GLOBAL, ConfigLevel.XDG):
             pygit2.settings.search_path[_level] = ""
         os.environ["GIT_CONFIG_GLOBAL"] = os.devnull
-        logging.getLogger("demandops").warning(
+        log.warning(
             "your settings for git are left out, also those for credentials: %s; mend that line",
             _error,
         )

@@ -7,7 +7,6 @@ the batch is dropped and its demands are evaluated again on the new tip.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
@@ -18,6 +17,7 @@ from pygit2 import Signature
 
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import one_line
+from demandops.base.runtime import log
 from demandops.decide import edits
 from demandops.decide.booking import Drain
 from demandops.decide.decision import Decision, decide
@@ -34,8 +34,6 @@ from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.load import snapshot as snapshots
 from demandops.repo.load.snapshot import Followed, Snapshot
-
-log = logging.getLogger("demandops")
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02

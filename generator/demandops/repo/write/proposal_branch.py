@@ -9,7 +9,6 @@ except GitLab's push options and the link that GitLab prints.
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from pygit2 import GitError, Oid, Repository, Tree
 from demandops.base import naming
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.quoting import quoted
+from demandops.base.runtime import log
 from demandops.base.settings import MAIN_BRANCH
 from demandops.repo.git import tree as trees
 from demandops.repo.git.remote_repository import RemoteRepository
@@ -28,8 +28,6 @@ from demandops.repo.git.repository import MAIN, PushDenied, StateRepository
 from demandops.repo.git.tree import commit_of
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.load import ledger_files
-
-log = logging.getLogger("demandops")
 
 PREFIX = "demand/"
 # where people propose; a command that proposes something else adds its folder here
