@@ -118,6 +118,7 @@ def context_named(name: str, field: str = "") -> Context:
 # ``--state-repo`` or the environment variable decides, there are no such defaults.
 
 Command = Callable[..., Any]
+Decorator = Callable[[Command], Command]
 
 _VARIABLE = "DEMANDOPS_STATE_REPO"
 _NAME = "demandops.context-name"
@@ -129,7 +130,7 @@ NO_STATE_REPO = (
 )
 
 
-def with_options(*options: Callable[[Command], Command]) -> Callable[[Command], Command]:
+def with_options(*options: Decorator) -> Decorator:
     return lambda command: reduce(lambda made, option: option(made), reversed(options), command)
 
 
@@ -202,7 +203,7 @@ _context_option = click.option(
 )
 
 
-def _state_repo(*, writes: bool = True, required: bool = True) -> Callable[[Command], Command]:
+def _state_repo(*, writes: bool = True, required: bool = True) -> Decorator:
     default = partial(_default_repo, writes=writes)
     where = f"{'the remote of ' if writes else ''}the checkout that you are in"
 
@@ -299,10 +300,10 @@ def names_of(*kinds: str) -> Callable[[click.Context, click.Parameter, str], lis
     return complete
 
 
-def name_options(helps: dict[str, str], **more: Any) -> Callable[[Command], Command]:  # noqa: ANN401
+def name_options(helps: dict[str, str], **more: Any) -> Decorator:  # noqa: ANN401
     """Add an option for each name, which a shell completes; one for several is named in plural."""
 
-    def option(name: str, text: str) -> Callable[[Command], Command]:
+    def option(name: str, text: str) -> Decorator:
         key, names = f"{name}s" if more.get("multiple") else name, names_of(f"{name}s")
         return click.option(f"--{name}", key, shell_complete=names, help=text, **more)
 

@@ -289,6 +289,7 @@ class Source:
     ) -> Source:
         """Add what clusters report, as read into their caches."""
         targets, domains = [planned.target for planned in self.running], self.domains
+        files = self.reader().file_reader(self.commit)
         reported = rollouts.statuses(targets, self.commit, caches, history, changed)
         unread = {
             name: cache.why_unknown(self.watched_objects.get(name, ()))
@@ -299,9 +300,7 @@ class Source:
             statuses={target.name: each for target, each in zip(targets, reported, strict=True)},
             watched=frozenset(caches),
             unreadable={name: reason for name, reason in sorted(unread.items()) if reason},
-            old_bootstraps=tuple(
-                rollouts.old_bootstraps(domains, caches, self.reader().file_reader(self.commit))
-            ),
+            old_bootstraps=tuple(rollouts.old_bootstraps(domains, caches, files)),
             orphans=tuple(rollouts.orphans(domains, targets, self.commit, caches, history)),
         )
 
@@ -313,9 +312,8 @@ class Source:
     def watched_objects(self) -> dict[str, list[ObjectSelector]]:
         """The objects that tell the health of the releases, by cluster."""
         wanted: dict[str, dict[ObjectSelector, None]] = {}
-        for domain in dict.fromkeys(
-            (*(planned.target.domain for planned in self.running), *self.domains)
-        ):
+        used = (planned.target.domain for planned in self.running)
+        for domain in dict.fromkeys((*used, *self.domains)):
             watched = health_reader(domain).objects_to_watch(domain)
             wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
         return {cluster: [*selectors] for cluster, selectors in wanted.items()}

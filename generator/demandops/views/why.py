@@ -87,9 +87,8 @@ def find(source: Source, name: str, kind: str | None = None) -> Thing:
     # a part of a release's name, or the start of a demand's id; what runs before what has ended
     running = sorted(release for release in source.releases if name in release)
     demands = sorted(id for id in _demands(source) if id.startswith(name))
-    stopped = commit_log.removed_files(
-        reader.objects, source.commit, commit_log.RELEASE_FILES
-    ).values()
+    files = commit_log.RELEASE_FILES
+    stopped = commit_log.removed_files(reader.objects, source.commit, files).values()
     ended = sorted({release for names in stopped for release in names})
     were = [release for release in ended if name in release]
     past = {id for entry in reader.log(source.commit) for id in entry.trailers.get("Demand-Id", ())}
@@ -415,13 +414,8 @@ def _held(source: Source, claims: Sequence[Claim], needed: Iterable[Release] | N
     return {
         "state": kinds.state_of(source, claims) if claims else "gone",
         "requesters": list(requesters_of(claims)),
-        "claims": [
-            kinds.claim_item(source, claim, kinds.state_of(source, [claim])) for claim in claims
-        ],
-        "releases": [
-            kinds.release_of(source, release)
-            for release in sorted(needed, key=lambda release: release.name)
-        ],
+        "claims": [kinds.claim_item(source, c, kinds.state_of(source, [c])) for c in claims],
+        "releases": [kinds.release_of(source, r) for r in sorted(needed, key=lambda r: r.name)],
     }
 
 
@@ -520,15 +514,14 @@ def stopped_with(source: Source, name: str) -> list[str]:
     """Return the other releases that an override stops which denies this one."""
     release = source.releases[name]
 
+    def service_of(each: Release) -> tuple[str, ...]:
+        return (each.key.service, each.node.id) if isinstance(each, ServiceRelease) else ()
+
     def is_stopped(other: Release) -> bool:
-        if isinstance(release, ServiceRelease):  # it denies the service on its node, for whatever
-            return isinstance(other, ServiceRelease) and (
-                (other.key.service, other.node.id) == (release.key.service, release.node.id)
-            )
-        # it denies all connections that the client carries
-        return not isinstance(other, ServiceRelease) and (
-            {*other.connections} <= {*release.connections}
-        )
+        if isinstance(release, ServiceRelease) or isinstance(other, ServiceRelease):
+            # it denies the service on its node, for whatever
+            return service_of(other) == service_of(release)
+        return {*other.connections} <= {*release.connections}  # it denies all that a client carries
 
     others = (other for other in source.releases.values() if other.name != name)
     return [other.name for other in others if is_stopped(other)]

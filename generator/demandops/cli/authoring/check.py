@@ -188,9 +188,7 @@ def _data(checked: CheckResult) -> Json:
         charts = {name: getattr(checked.charts, name) for name in names}
     files = merge.files if merge else ()
     diffs, left_out = _bounded(files, _MOST_DIFF_LINES_JSON)
-    changes = [
-        {"file": file.path, "change": file.change, "diff": diffs.get(file.path)} for file in files
-    ]
+    changes = [{"file": f.path, "change": f.change, "diff": diffs.get(f.path)} for f in files]
     return {
         "faults": [asdict(fault) for fault in checked.faults],
         "warnings": [asdict(warning) for warning in checked.warnings],

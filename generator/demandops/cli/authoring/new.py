@@ -435,9 +435,7 @@ def _example_demand(
     """Return the text of an example, and whether the rules of the node's domain allow it."""
     node, domain = config.nodes.get(id), config.domain_of.get(id)
     topics, rules = node.topics if node else {}, domain.rules if domain else ()
-    allowing = [
-        rule for rule in rules if matches(name, rule.applications) and matches(id, rule.nodes)
-    ]
+    allowing = [r for r in rules if matches(name, r.applications) and matches(id, r.nodes)]
     # The requester matches a rule that allows the application. If there is none, it matches the
     # first rule, and a person must widen the rules.
     requester = "operator"

@@ -241,9 +241,8 @@ def _create(
         # a name in git may have characters that an owner may not have
         person = repo.operator()
         owner = person.email if id_problem(person.name) else person.name
-        given = {"reason": options.reason, "owner": owner} | {
-            field: value for field, value in fields.items() if value is not None
-        }
+        given = {"reason": options.reason, "owner": owner}
+        given |= {field: value for field, value in fields.items() if value is not None}
         text = document(path, "override", "Override", {**given, "select": [selected]})
         parsed = Override.from_file(name, parse_file(OverrideFile, text, path))
         note = "  refuses what is new; what runs may be renewed, reduced and released"

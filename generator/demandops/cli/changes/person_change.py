@@ -81,9 +81,7 @@ class Options:
         return replace(self, reason=reason)
 
 
-def changing(
-    *more: Callable[[target.Command], target.Command], dry_run: bool = True
-) -> Callable[[target.Command], target.Command]:
+def changing(*more: target.Decorator, dry_run: bool = True) -> target.Decorator:
     # the command gets the values of these options as `options`
     def add(command: target.Command) -> target.Command:
         @wraps(command)

@@ -114,9 +114,7 @@ def status(
             "old_bootstraps": [asdict(bootstrap) for bootstrap in source.old_bootstraps],
             "orphans": [asdict(orphan) | {"command": orphan.command} for orphan in source.orphans],
             "missing_inputs": [asdict(missing) for missing in lacking],
-            "unreadable": [
-                {"cluster": name, "reason": why} for name, why in source.unreadable.items()
-            ],
+            "unreadable": [{"cluster": c, "reason": why} for c, why in source.unreadable.items()],
             "faults": [{"code": "invalid", **problem._asdict()} for problem in source.problems],
         }
         text: list[str | Table] = [f"  {problem}" for problem in source.problems]
