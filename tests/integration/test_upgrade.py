@@ -20,7 +20,7 @@ from demandops.repo.git import remote_repository
 from tests.integration.conftest import On
 from tests.kit.cli import PROGRAM, Dialogue, Ran, Run, process
 from tests.kit.goals import perception
-from tests.kit.repo import GitRepo
+from tests.kit.repo import GitRepo, hook
 from tests.kit.rig import book, running
 
 ROOT = Path(__file__).parents[2]
@@ -105,6 +105,13 @@ def test_a_url_is_pushed_to_and_tried_again_when_somebody_was_first(
     summaries = [text.split("\n")[0] for text in state.commits()]
     assert summaries[:2] == ["Render everything again, for Argo CD", "By hand"]
     assert verified(on) == [None]
+
+
+def test_a_hook_of_the_state_repo_decides(on: On, state: GitRepo) -> None:
+    hook(state, "pre-receive", "[ -e open ] || { echo closed today >&2; exit 1; }")
+    assert "closed today" in on.refused("upgrade", "--gitops", "argocd")
+    (state.path / "open").touch()
+    assert on.json("upgrade", "--gitops", "argocd")["commit"] == state.tip
 
 
 def test_a_state_repo_that_never_stands_still_is_told(

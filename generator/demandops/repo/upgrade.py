@@ -77,7 +77,7 @@ def upgrade(
     signer: Signer | None,
 ) -> Upgrade:
     # InvalidInput is raised if the state repo is not valid, or the request cannot be fulfilled
-    with reader.opened(address) as repo:
+    with reader.opened(address, only_read=False) as repo:
         repository = repo.repository
         repository.signer = signer
         for attempt in range(1, _ATTEMPTS + 1):

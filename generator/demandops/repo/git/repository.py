@@ -415,13 +415,6 @@ class Checkout(StateRepository):
         if self.objects.is_empty or self.objects.head_is_unborn:
             raise StateRepoError(f"{path} has no commit yet; commit its files first")
 
-    def publish(self, expected: Oid, commit: Oid) -> bool:
-        # a person may be editing the files, and would commit back what a demand has changed
-        raise PushDenied(
-            f"{self.address} is a checkout, and no command writes to a checkout; name the "
-            "checkout's remote instead"
-        )
-
 
 class LastFetch(StateRepository):
     """The clone of a URL at its last fetch, for readers that must not wait for the network."""
