@@ -158,6 +158,8 @@ def test_what_changed_between_commits_is_known(bare: Path, person: Person, tmp_p
     assert repo.changed_paths(first, chart) == [f"{CHART}/notes.txt", "notes.txt"]
     assert repo.changed_paths(chart, chart) == []
     assert repo.changed_paths("", chart) is repo.changed_paths(UNKNOWN, chart) is None
+    bare.rename(bare.with_name("moved.git"))  # a damaged clone is away while it is made anew
+    assert not repo.includes(chart, first)
 
 
 def test_a_generator_answers_for_the_past_without_another_clone(url: str, data_home: Path) -> None:

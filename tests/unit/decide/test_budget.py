@@ -9,6 +9,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -18,6 +19,7 @@ from demandops.base.errors import Fault, InvalidInput, OverBudget, Refused
 from demandops.decide.decision import decide
 from demandops.decide.placement.placement import MOST_ATTEMPTS
 from demandops.model.config.load import load
+from rpds import HashTrieMap
 
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, override, skeleton
@@ -163,6 +165,17 @@ LARGE = {
         [connection(f"c{n}", topics=[f"/t{n}"], broker="") for n in range(300)],
     ),
 }
+
+
+def test_drained_nodes_are_found_without_a_look_at_all_that_run_something() -> None:
+    nodes = [{"id": "e000", "type": "edge", "cluster": "c-its", "drained": True}]
+    file = {"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": nodes}
+    state, calls = repo(files={"inventory/nodes/edges.yaml": yaml.safe_dump(file)}).state, [0]
+    used = HashTrieMap({f"e{n:03}": 1 for n in range(1_000)})
+    state = replace(state, ledger=replace(state.ledger, applications_on=used))
+    with counted(calls):
+        assert state.nodes_to_drain() == ["e000"]
+    assert calls[0] < 100
 
 
 @pytest.mark.parametrize("name", LARGE)

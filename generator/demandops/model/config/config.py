@@ -111,8 +111,9 @@ class Config:
     )
     # For each property, the type of its value on most nodes, and the first node with this type
     property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
-    # Whether a listed node, or one of a pattern, is drained
-    has_drained: bool = field(init=False, compare=False, repr=False)
+    # The listed nodes that are drained, and whether all nodes of a pattern are
+    drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
+    drains_patterns: bool = field(init=False, compare=False, repr=False)
     limits_capacity: bool = field(init=False, compare=False, repr=False)
     # The input roles, sorted, that are the `root` of a service in at least one appdef
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
@@ -145,7 +146,8 @@ class Config:
             "kinds": kinds_by_id,
             "nodes_with": {trait: tuple(nodes) for trait, nodes in by_trait.items()},
             "property_kinds": {name: (kind, ids[0]) for name, (kind, ids) in kinds.items()},
-            "has_drained": any(node.drained for node in kinds_by_id.values()),
+            "drained_nodes": tuple(id for id, node in self.nodes.items() if node.drained),
+            "drains_patterns": any(node.drained for node in examples),
             "limits_capacity": any(node.capacity is not None for node in kinds_by_id.values()),
             "roles_with_services": tuple(sorted({s.root for s in services if s.root})),
             "application_versions": {name: self._versions(name) for name in self.services},

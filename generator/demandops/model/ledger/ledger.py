@@ -307,6 +307,8 @@ class World:
 
     def nodes_to_drain(self) -> list[str]:
         """Return the drained nodes with applications or services that were placed there."""
-        used, nodes = self.ledger.applications_on, self.config.nodes
-        drained = (id for id in used if (node := nodes.get(id)) and node.drained)
-        return sorted(drained) if self.config.has_drained else []
+        used, config = self.ledger.applications_on, self.config
+        drained: Iterable[str] = config.drained_nodes
+        if config.drains_patterns:  # their nodes are known only by their use
+            drained = (id for id in used if (node := config.nodes.get(id)) and node.drained)
+        return sorted(id for id in drained if id in used)

@@ -354,7 +354,9 @@ class StateRepository:
         return Repository(self.objects.path)
 
     def includes(self, commit: str, other: str) -> bool:
-        return commit == other or trees.includes(self.reopened(), commit, other)
+        with suppress(pygit2.GitError):  # a damaged clone is being made anew
+            return commit == other or trees.includes(self.reopened(), commit, other)
+        return False
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
         with suppress(StateRepoError):
