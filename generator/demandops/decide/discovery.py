@@ -233,10 +233,13 @@ def _differences(
         field for field in {*before, *after} if before.get(field) != after.get(field)
     ):
         was, now = before.get(field), after.get(field)
-        told, keys = f"{field} {_text(was)} → {_text(now)}", list[str]()
-        match field:  # its keys are the labels from which it comes
+        told = f"{field} {_text(was)} → {_text(now)}"
+        keys = list[str]()  # the labels from which the field comes
+        match field:
+            case "drained" if now:
+                told, keys = "cordoned", [""]
             case "drained":
-                told, keys = "cordoned" if now else "no longer cordoned", [""] if now else []
+                told = "no longer cordoned"
             case "type":
                 keys = [how.type_label]
             case "capabilities":

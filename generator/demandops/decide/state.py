@@ -77,10 +77,11 @@ class State(World):
 
         Nothing that runs differs, so all that was counted of it stays valid.
         """
-        state, counted = replace(self, config=config), vars(self).keys() & {"usage", "names"}
-        if config.limits_capacity != self.config.limits_capacity:
-            counted.discard("usage")
-        vars(state).update({name: getattr(self, name) for name in counted})
+        valid = {"names"}
+        if config.limits_capacity == self.config.limits_capacity:
+            valid.add("usage")
+        state = replace(self, config=config)
+        vars(state).update({name: kept for name, kept in vars(self).items() if name in valid})
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:

@@ -119,11 +119,13 @@ def _only_rewrites(commit: Commit, path: str) -> bool:
 
 def _is_canonical(commit: Commit, path: str) -> bool:
     record, text = _record_at(commit.tree, path), trees.read_text(commit.tree, path) or ""
-    if record is None or LEDGER_API_VERSION not in text:  # an older one
-        return record is not None
-    if isinstance(record, Claim):
-        return text == claim_files.text_of(record)
-    return text == records.waiting_text(record)
+    if record is None:
+        return False
+    if LEDGER_API_VERSION not in text:  # of an older schema, which had its own form
+        return True
+    return text == (
+        claim_files.text_of(record) if isinstance(record, Claim) else records.waiting_text(record)
+    )
 
 
 def _record_at(tree: Tree, path: str) -> Claim | WaitingDemand | None:

@@ -117,7 +117,7 @@ def _application_faults(  # noqa: PLR0912 - a branch for each fault
 
 
 def _delivery_faults(where: str, delivery: Delivery, services: Services) -> Iterator[Fault]:
-    name, outputs = delivery.output.partition(".")[0], named_outputs(services)
+    outputs, name = named_outputs(services), delivery.output.partition(".")[0]
     if delivery.output not in outputs:
         close = suggestion(delivery.output, outputs)
         yield fault(f"{where}.output", f"{quoted(delivery.output)} is not an output{close}")

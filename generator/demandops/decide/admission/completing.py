@@ -28,10 +28,11 @@ def completed(demand: AnyDemand, state: State, checkpoint: Callable[[], None]) -
     def moved(app: Application) -> Application:
         # The moved services of a booked application stay on the booked nodes. Only a change of an
         # override or of a definition moves them again, and not a further demand.
-        booked = ledger.application(app.id)
-        stays = replace(app, moved=booked.moved) if booked else app
-        is_same = booked is not None and stays.has_same_definition_and_nodes(booked)
-        return stays if is_same else with_overridden_nodes(app, state)
+        if booked := ledger.application(app.id):
+            stays = replace(app, moved=booked.moved)
+            if stays.has_same_definition_and_nodes(booked):
+                return stays
+        return with_overridden_nodes(app, state)
 
     demand = demand.with_each(moved)
     if flows.reads_outputs(demand):

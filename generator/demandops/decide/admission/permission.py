@@ -76,9 +76,10 @@ def needed_access(
 
 def may_place(item: Item, node: str, config: Config) -> bool:
     """Return whether the requesters may use a node for an application, or as a connection's end."""
-    domain, access = config.domain_of.get(node), [("nodes", config.host_of(node))]
+    domain = config.domain_of.get(node)
+    access = [("nodes", config.host_of(node))]
     if isinstance(item.held, Application) and item.held.appdef:
-        access.insert(0, ("applications", item.held.appdef))
+        access = [("applications", item.held.appdef), *access]
     return domain is not None and not any(_not_allowed(item, domain, access))
 
 

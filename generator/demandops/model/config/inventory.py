@@ -33,8 +33,9 @@ from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, I
 _NAME = "[a-z][A-Za-z0-9_]*"
 _TEXT = re.compile(r"[A-Za-z0-9]([A-Za-z0-9 ._+:/-]{0,61}[A-Za-z0-9])?")
 _CONDITION = re.compile(rf"({_NAME})(>=|<=|=)(.+)")
-_COMPARED: dict[str, Callable[[Any, Any], bool]]
-_COMPARED = {"=": operator.eq, ">=": operator.ge, "<=": operator.le}
+_COMPARED: dict[str, Callable[[Any, Any], bool]] = {
+    "=": operator.eq, ">=": operator.ge, "<=": operator.le,
+}  # fmt: skip
 _BOUNDS = {"min": ">=", "max": "<="}
 
 # The name of a property; it includes the unit of the value, as in `memoryGiB`

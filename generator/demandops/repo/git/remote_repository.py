@@ -568,7 +568,7 @@ def is_url(address: str) -> bool:
 def connect(
     address: str, folder: Path, *, allow_offline: bool = False, only_read: bool = False
 ) -> StateRepository:
-    """Return the state repo at an address: a URL, or a folder where main is not checked out.
+    """Return the state repo at an address: a URL, or the folder of a bare repository.
 
     The clone of what is pushed to is made in ``folder``; with ``allow_offline``, an existing one is
     used if its remote is away. With ``only_read``, the address may also be that of a checkout.
@@ -595,7 +595,7 @@ def connect(
     try:
         path = Path(address).expanduser()
         is_folder, exists = path.is_dir(), path.exists()
-        is_read_only = is_checkout(path) and only_read
+        is_of_person = is_checkout(path)
     except (OSError, ValueError, RuntimeError) as error:  # for example ``~x`` without a user x
         reason = getattr(error, "strerror", None) or str(error)
         raise StateRepoError(
@@ -609,7 +609,13 @@ def connect(
             f"{address} does not exist{place}; correct the path, or make a state repo there with "
             f"`demandops init {address} --bare`"
         )
-    if is_read_only:
+    if is_of_person and not only_read:
+        # a person may be editing the files, and would commit back what a demand has changed
+        raise StateRepoError(
+            f"{address} is a checkout, and DemandOps never writes to one; name its remote instead, "
+            f"or use a bare clone: git clone --bare {path} {path}.git"
+        )
+    if is_of_person:
         return repositories.Checkout(path)
     repository = StateRepository(path)
     if only_read or not repositories.needs_push(address):

@@ -152,7 +152,7 @@ def access_error(error: Exception, address: str, objects: Repository | None = No
 
 @contextmanager
 def using(address: str, objects: Repository | None = None) -> Iterator[None]:
-    # an error of the system or of libgit2 then names the address
+    # any error then names the address; `reading` is for errors of the objects alone
     try:
         yield
     except Exception as error:
