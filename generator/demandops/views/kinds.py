@@ -24,7 +24,7 @@ from demandops.model.config.config import DOMAINS_FILE, NODES_FILE
 from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
 from demandops.model.demand.demand import Lease
 from demandops.model.ledger.claim import Claim, demand_id, requesters_of
-from demandops.model.ledger.records import WaitingDemand
+from demandops.model.ledger.records import WaitingDemand, in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history import commit_log
 from demandops.repo.history.commit_log import LogEntry
@@ -282,7 +282,7 @@ def _demands(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
     for id, claims in sorted(held, key=lambda pair: (min(c.booked for c in pair[1]), pair[0])):
         runs = _runs(source, source.releases_of_demands.get(id, []))
         yield id, (claims, state_of(source, claims), runs)
-    for waiting in source.state.ledger.waiting.values():
+    for waiting in in_turn(source.state.ledger.waiting):
         yield f"waiting {waiting.demand}", (waiting, "waiting", {"releases": [], "health": None})
 
 

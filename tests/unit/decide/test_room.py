@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import timedelta
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,6 +14,8 @@ from demandops.decide.placement.relocation import with_moves
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger import records
 from demandops.model.ledger.records import WaitingDemand
+from demandops.views.kinds import KINDS
+from rpds import HashTrieMap
 
 from tests.kit import plain_yaml
 from tests.kit.connections import state
@@ -67,3 +71,13 @@ def test_a_drain_in_parts_moves_the_same_applications_and_skips_none() -> None:
     stays = [text.split(",")[0] for part in parts for text in part.stays]
     assert stays == [text.split(",")[0] for text in whole.stays]
     assert sum(len(part.moved) for part in parts) == 3
+
+
+def test_waiting_demands_are_listed_in_their_turn() -> None:
+    demands = [
+        (read_goal(put(name)), NOW + timedelta(place)) for place, name in enumerate("zyxwvu")
+    ]
+    given = [WaitingDemand(*each) for each in demands]
+    ledger = SimpleNamespace(waiting=HashTrieMap({each.demand: each for each in given}))
+    source: Any = SimpleNamespace(claims_of_demands={}, state=SimpleNamespace(ledger=ledger))
+    assert [values[0] for _, values in KINDS["demands"].entries(source)] == given
