@@ -45,9 +45,14 @@ class _Format(click.Choice[str]):
 
 def output_formats(*formats: str) -> Callable[[Command], Command]:
     # with ``--output json``, a command that raises DemandOpsError also prints the faults as JSON
-    names, form = ("-o", "--output"), _Format(formats)
-    help = "The output format."
-    option = click.option(*names, type=form, default="text", show_default=True, help=help)
+    option = click.option(
+        "-o",
+        "--output",
+        type=_Format(formats),
+        default="text",
+        show_default=True,
+        help="The output format.",
+    )
 
     def add(command: Command) -> Command:
         @wraps(command)
@@ -279,4 +284,5 @@ def list_table(
                 clock = since and f"{since.astimezone(timezone.utc):%Y-%m-%d %H:%M:%S}"
                 texts.append([clock] if clock else [])
     how_to_see = "in a wider terminal" if wide is None else "with -o wide"
-    return Table(columns, cells, "", f"no {kind.name}", STYLES, bool(wide), how_to_see)
+    empty, whole = f"no {kind.name}", bool(wide)
+    return Table(columns, cells, empty=empty, styles=STYLES, whole=whole, how_to_see=how_to_see)

@@ -68,16 +68,15 @@ def causes(source: Source) -> list[Cause]:
 
 
 def _unread_or_invalid(source: Source) -> Iterator[Cause]:
-    repo: tuple[Kind, str] = "unread", "The state repo"
     if source.unread:
         who = "the operator of the Git server or of this program"
         how = "mend what the text above names; the program tries again"
         why = "cannot be read, so this may be out of date"
-        yield Cause(*repo, why, who, how, told=source.unread)
+        yield Cause("unread", "The state repo", why, who, how, told=source.unread)
     if source.push_denied:
         why = "takes no commit of this generator, so demands wait, and are refused after some time"
         who, how = "the operator of the Git server", "let the generator's account push to main"
-        yield Cause(*repo, why, who, how, told=source.push_denied)
+        yield Cause("unread", "The state repo", why, who, how, told=source.push_denied)
     of_commits: dict[str, list[Problem]] = {}
     for problem in source.problems:
         of_commits.setdefault(problem.since or problem.file, []).append(problem)

@@ -406,6 +406,12 @@ def _releases(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
         yield name, (planned.release, planned.claims, status)
 
 
+def _services(source: Source) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    for name, values in _releases(source):
+        if isinstance(values[0], ServiceRelease):
+            yield name, values
+
+
 def release_of(source: Source, release: Release) -> Json:
     # that runs, or that an override stops
     claims = source.claims_of_releases.get(release.name)
@@ -612,11 +618,12 @@ def _override_was(reader: Reader, entry: LogEntry, path: str) -> Json:
 
 
 def effect_texts(override: Json, *_: object) -> list[str]:
-    return [
+    texts = []
+    for name, value in override["effects"].items():
         # of images and values their names, and `hold: true` without its value
-        name if value is True else f"{name} {', '.join(value) if type(value) is dict else value}"
-        for name, value in override["effects"].items()
-    ]
+        shown = ", ".join(value) if isinstance(value, dict) else value
+        texts.append(name if value is True else f"{name} {shown}")
+    return texts
 
 
 def _affected(item: Json, now: datetime) -> list[str]:
@@ -726,7 +733,7 @@ KINDS: dict[str, Kind] = {
                 *(_VERSION, _CLUSTER, _wide("inputs", "Takes in", texts_of=_inputs)),
                 _wide("parameters", "Parameters", texts_of=_pairs("parameters", " = ")),
             ),
-            lambda source: (e for e in _releases(source) if isinstance(e[1][0], ServiceRelease)),
+            _services,
             _release,
             lambda item: {"release": [item["name"]]},
         ),

@@ -25,8 +25,10 @@ LANES = {
 }
 
 # The spans of time that a person can choose, in seconds; 0 means all known events.
-SPANS = {"15min": 900, "1h": 3600, "6h": 6 * 3600}
-SPANS |= {"1d": 86400, "7d": 7 * 86400, "30d": 30 * 86400, "all": 0}
+SPANS = {
+    "15min": 900, "1h": 3600, "6h": 6 * 3600,
+    "1d": 86400, "7d": 7 * 86400, "30d": 30 * 86400, "all": 0,
+}  # fmt: skip
 
 # How many events a span that nobody chose must have, if there are more.
 _ENOUGH = 50

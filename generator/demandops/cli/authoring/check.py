@@ -173,9 +173,11 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
         for word, faults in (("error", checked.faults), ("warning", checked.warnings)):
             for fault in faults:
                 errors.print(f"{word}: {fault}")
-        valid = f"{directory}: all files are valid and every release renders"
-        valid_lines = [] if checked.faults else [valid, *chart_lines(checked.charts)]
-        for line in (*valid_lines, *_lines(checked)):
+        if not checked.faults:
+            say(f"{directory}: all files are valid and every release renders")
+            for line in chart_lines(checked.charts):
+                say(line)
+        for line in _lines(checked):
             say(line)
     if checked.faults:
         raise click.exceptions.Exit(1)
@@ -206,7 +208,8 @@ def _data(checked: CheckResult) -> Json:
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
     # the diffs that fit into `most` lines, by path, and the number of other lines
-    shown, left_out = dict[str, str](), 0
+    shown: dict[str, str] = {}
+    left_out = 0
     for file in files:
         lines = list(file.diff())
         if len(lines) <= most:

@@ -24,7 +24,7 @@ from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
 from demandops.cli import target
-from demandops.cli.changes.ledger_change import await_answer, follows, started_generator
+from demandops.cli.changes.ledger_change import await_answer, consequence_of, started_generator
 from demandops.cli.changes.person_change import confirm
 from demandops.cli.formats import faults_of, output_option, print_json
 from demandops.cli.output import busy, done, errors, say
@@ -153,17 +153,19 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     else:
         if is_unread:
             message = "not booked, because another request of the same command cannot be parsed"
-            unread = (form_faults(each.goal) or [fault("", message)] for each in documents)
+            not_booked = [fault("", message)]
             rows = [
-                _refused(index, document, InvalidInput(faults))
-                for index, (document, faults) in enumerate(zip(documents, unread, strict=True))
+                _refused(index, document, InvalidInput(form_faults(document.goal) or not_booked))
+                for index, document in enumerate(documents)
             ]
         elif dry_run:
             rows = _dry_run(documents, state_repo, output)
         else:
             if release and not yes:
                 decided = [each for _, _, each in _decided(documents, state_repo)]
-                for line in follows([each for each in decided if isinstance(each, Decision)]):
+                for line in consequence_of(
+                    [each for each in decided if isinstance(each, Decision)]
+                ):
                     errors.print(line)
                 confirm("Continue?", yes)
             rows = _book(documents, state_repo, wait, signing_key)
@@ -171,7 +173,7 @@ def demand(  # noqa: PLR0912, PLR0913, PLR0917 - each is an option
     if via is None and output == "text" and not is_unread:
         way = f"directly in the state repo {state_repo}; to send it to a node: --via ros"
         errors.print("(by a node, over ROS)" if over_ros else f"({way})")
-    if unanswered := sum(_is_unanswered(row) for row in rows) if not dry_run else 0:
+    if unanswered := 0 if dry_run else sum(map(_is_unanswered, rows)):
         errors.print(f"{len(rows) - unanswered} of {len(rows)} requests have an answer")
         raise click.Abort
     if any(row["outcome"] in ("refused", "unknown") for row in rows):

@@ -104,7 +104,7 @@ def _book(
             return data, (), []
     changes, releases = decision.changes.claims, [asdict(each) for each in decision.releases]
     data |= {"outcome": decision.outcome, "releases": releases}
-    lines = [*(f"would be {told(change)}" for change in changes), *follows([decision])]
+    lines = [*(f"would be {told(change)}" for change in changes), *consequence_of([decision])]
     lines = [fitted(line, terminal_width()) for line in lines]
     if options.dry_run:
         return data, changes, lines
@@ -123,7 +123,7 @@ def _book(
     return data, receipt.changes, [*map(told, receipt.changes)]
 
 
-def follows(decisions: Collection[Decision]) -> Iterator[str]:
+def consequence_of(decisions: Collection[Decision]) -> Iterator[str]:
     changes = [change for decision in decisions for change in decision.changes.claims]
     less = [change.before for change in changes if change.before and change.only_narrows]
     who = {name for claim in less for name in claim.requesters}
@@ -166,8 +166,9 @@ def _end(name: str, kinds: Sequence[str], options: Options) -> None:
     elif data["commit"]:
         word = "released" if is_release else "decommissioned"
         lines.append(f"'{ended}' is {word} in {data['commit']}")
-        again = "if it is demanded again, it runs again; `demandops suspend` prevents that"
-        lines += [again] if is_release else []
+        if is_release:
+            again = "if it is demanded again, it runs again; `demandops suspend` prevents that"
+            lines.append(again)
     # of an application the claims end, and what else their demands list stays
     demands, keys = {change.key.demand for change in changes}, {change.key for change in changes}
     kept = sorted({str(c.subject) for c in before if c.demand in demands and c.key not in keys})
@@ -203,15 +204,14 @@ def _meant(name: str, kinds: Iterable[str], state: State, earlier: State | None 
             raise InvalidInput.at("", message)
     for kind, names in known.items():
         if name in names:
-            command = "decommission" if kind in ("node", "requester") else "release"
+            verb = "decommission" if kind in ("node", "requester") else "release"
+            run = f"run: demandops {verb} {shlex.quote(name)}"
             demands = sorted({claim.demand for claim in ledger if name in claim.requesters})
-            way = "run"
-            if command == "decommission" and demands:
-                way = f"to stop one demand, name it: {fitted(', '.join(demands), 200)}; to release "
-                way += "all that it holds, run"
-            is_a = f"is {'an' if kind == 'application' else 'a'} {kind}"
-            command = f"demandops {command} {shlex.quote(name)}"
-            raise InvalidInput.at("", f"'{name}' {is_a}; {way}: {command}")
+            if verb == "decommission" and demands:
+                listed = fitted(", ".join(demands), 200)
+                run = f"to stop one demand, name it: {listed}; to release all that it holds, {run}"
+            article = "an" if kind == "application" else "a"
+            raise InvalidInput.at("", f"'{name}' is {article} {kind}; {run}")
     return name
 
 

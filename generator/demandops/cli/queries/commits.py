@@ -308,7 +308,8 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
             faults.append(fault(f"--{name}", message))
     if (node := given["node"]) is not None:
         # no commit needs to have changed a node that the inventory has
-        config, commits = repo.snapshot().state.config, (entry.commit for entry in repo.log())
+        config = repo.snapshot().state.config
+        commits = (entry.commit for entry in repo.log())
         if not config.has_node(node) and not any(repo.changes_node(id, node) for id in commits):
             faults.append(fault("--node", f"{quoted(node)} {config.why_no_node(node)}"))
     if faults:
