@@ -28,7 +28,6 @@ from demandops.model.config.config import Config
 from demandops.model.demand.demand import Application, Lease
 from demandops.model.ledger.claim import Claim, path_of, text_of
 from demandops.model.ledger.ledger import World
-from demandops.model.ledger.records import WaitingDemand
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.load import snapshot
 from demandops.repo.write.commit_batch import CommitBatch
@@ -94,6 +93,20 @@ def answered_first(kind: type) -> Wrong:
         return right(worker, commits, results, *more)
 
     return publish
+
+
+def separating(change: Wrong) -> Wrong:
+    """Return a ``with_separate_instances`` that changes each application, demanded and made."""
+
+    def separate(right: Wrong, asked: Any, config: Config) -> Any:
+        made = [
+            replace(new, held=change(old.held, new.held))
+            if isinstance(old.held, Application) else new
+            for old, new in zip(asked.demanded, right(asked, config).demanded, strict=True)
+        ]  # fmt: skip
+        return replace(asked, demanded=tuple(made))
+
+    return separate
 
 
 def ending_any_join(shut_down: Wrong, ledger: Any, asked: Any) -> Any:
@@ -173,12 +186,11 @@ FAULTS: dict[str, Fault] = {
     "count_sources_for_topics": Fault(15, planner, "_replicas_of",
         lambda right, scaling, parameters, topics, *more:
             right(scaling, parameters, {one.source: one for one in topics}.values(), *more)),
-    "share_one_instance": Fault(0, completing, "_separated", itself),
-    "move_instances_with_the_channel": Fault(0, completing, "_separated",
-        lambda separated, app, config: replace(separated(app, config), version=app.version)),
-    "keep_the_channel_of_the_default_version": Fault(95, completing, "_separated",
-        lambda separated, app, config:
-            made if (made := separated(app, config)).separate else app),
+    "share_one_instance": Fault(0, decision, "with_separate_instances", itself),
+    "move_instances_with_the_channel": Fault(0, decision, "with_separate_instances",
+        separating(lambda app, made: replace(made, version=app.version))),
+    "keep_the_channel_of_the_default_version": Fault(95, decision, "with_separate_instances",
+        separating(lambda app, made: made if made.separate else app)),
     "take_the_first_domain": Fault(2, Config, "nodes_of", lambda _, config, node: (node,)),
     "forget_what_is_booked_in_a_domain": Fault(14, completing, "_chosen",
         lambda chosen, one, booked, *more: chosen(one, {}, *more)),
@@ -200,8 +212,8 @@ FAULTS: dict[str, Fault] = {
     # ---- placement ----
     "let_the_last_in_first": Fault(1, agenda, "in_turn",
         lambda in_turn, *given: in_turn(*given)[::-1]),
-    "ignore_priorities": Fault(79, WaitingDemand, "turn",
-        lambda _, one: (one.since, one.demand)),
+    "ignore_priorities": Fault(79, agenda, "in_turn",
+        lambda _, waiting: sorted(waiting.values(), key=lambda one: (one.since, one.demand))),
     "begin_the_wait_anew": Fault(3, decision, "_wait",
         lambda wait, state, demand, reasons, now, *more:
             (request := wait(state, demand, reasons, now, *more))

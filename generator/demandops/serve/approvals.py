@@ -323,11 +323,7 @@ class Approvals:
             if proposal.record.commits and (not booked or head in proposal.record.commits):
                 self._delete_branch(proposal.branch, heads)
             self._delete_replaced(proposal, heads)
-        # by this check: a person may have merged it just before, which only a later main shows
-        if (verdict.failed or verdict.free) and (head, commits) != (
-            heads.branches.get(proposal.branch, ""),
-            proposal.record.commits,
-        ):
+        if (verdict.failed or verdict.free) and self._has_moved(proposal, commits, head, heads):
             proposal.tickets = [ticket for ticket in tickets if ticket.state != "done"]
             proposal.searched_to = searched
             self._changed.append(proposal.branch)
@@ -338,6 +334,14 @@ class Approvals:
         if not verdict.unapproved:
             cause = next((error for _, error in verdict.failed), "it needs no approval any more")
             self._forget(proposal, "" if booked else str(cause))
+
+    @staticmethod
+    def _has_moved(
+        proposal: Proposal, commits: tuple[str, ...], head: str, heads: BranchHeads
+    ) -> bool:
+        # by this check: a person may have merged it just before, which only a later main shows
+        there = heads.branches.get(proposal.branch, "")
+        return (there, proposal.record.commits) != (head, commits)
 
     def _receipt(
         self,
