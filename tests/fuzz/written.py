@@ -19,9 +19,9 @@ import pyjson5
 import yaml
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
-from demandops.cli.changes.configure import override_text, selector
+from demandops.cli.changes.configure import selector
 from demandops.decide.state import try_configuration
-from demandops.model.config.base_model import parse_file
+from demandops.model.config import base_model
 from demandops.model.config.load import load
 from demandops.model.config.override import Override, OverrideFile
 from demandops.model.demand.goals import _value_problem
@@ -131,11 +131,11 @@ def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
         "values": patch,
         "select": [selector({"node": (*nodes,)})],
     }
-    text = override_text("x", wanted)
+    text = base_model.document("overrides/x.yaml", "override", "Override", wanted)
     data = strict_yaml.load(text)
     assert {key: data[key] for key in wanted} == wanted
     assert text.startswith("# yaml-language-server: ") and plain_yaml.load(text) == data
-    Override.from_file("x", parse_file(OverrideFile, text, "overrides/x.yaml"))
+    Override.from_file("x", base_model.parse_file(OverrideFile, text, "overrides/x.yaml"))
 
 
 # ---- Git and forges ----
